@@ -1,0 +1,1 @@
+"""Differentiable sequential convex programming: numbers only, no ROS."""

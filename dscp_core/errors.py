@@ -1,0 +1,25 @@
+"""Exceptions shared by every package of the project."""
+
+from __future__ import annotations
+
+from typing import Any
+
+
+class DscpError(Exception):
+    """Base class of every error that this project raises on purpose."""
+
+
+class InvalidInputError(DscpError, ValueError):
+    """A value from outside violates a stated bound.
+
+    Attributes:
+        field: Name of the offending field or parameter.
+        value: The value that was given.
+        bound: What was expected, in words or as an interval.
+    """
+
+    def __init__(self, field: str, value: Any, bound: str) -> None:
+        super().__init__(f"{field}: {value!r} violates {bound}")
+        self.field = field
+        self.value = value
+        self.bound = bound

@@ -1,0 +1,1 @@
+"""Published results, computed again: one module per study, and what they share."""

@@ -1,0 +1,200 @@
+"""What `dscp plan` and `dscp gradient` share: options that describe a case, and strict JSON."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+from collections.abc import Mapping, Sequence
+from enum import Enum
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from dscp_core.errors import InvalidInputError
+
+if TYPE_CHECKING:
+    from dscp_core.parameters import Parameter, Value
+    from dscp_core.planner import PlannerSettings
+    from dscp_core.scp import ScpOptions
+
+DEFAULT_INTERVALS = 50
+# Beyond this, memory and time grow without a visible gain in accuracy.
+MOST_INTERVALS = 2000
+
+
+def add_case_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declares the options that describe a case."""
+    parser.add_argument("problem", metavar="PROBLEM", help="what to solve: powered_descent")
+    group = parser.add_argument_group("case")
+    group.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        dest="assignments",
+        metavar="NAME=VALUE",
+        help="set a parameter in SI units, a vector as a,b,c; may be repeated",
+    )
+    group.add_argument(
+        "--vehicle",
+        type=Path,
+        metavar="FILE",
+        help="YAML file of parameter names and SI values; --set wins over it",
+    )
+    group.add_argument(
+        "--list-parameters",
+        action="store_true",
+        help="print every parameter with its value in this case, unit and bounds, and exit",
+    )
+    group = parser.add_argument_group("method")
+    group.add_argument(
+        "--free-terminal-time",
+        action="store_true",
+        help="let the solver choose the terminal time; --set terminal_time is then a first guess",
+    )
+    group.add_argument(
+        "--formulation",
+        metavar="NAME",
+        help="powered_descent: convergent (default), or printed: the paper's appendix as it stands",
+    )
+    group.add_argument(
+        "--intervals",
+        type=int,
+        default=DEFAULT_INTERVALS,
+        metavar="N",
+        help=f"time intervals of the trajectory, 2 to {MOST_INTERVALS} (default %(default)s)",
+    )
+    group.add_argument(
+        "--solver",
+        metavar="NAME[,NAME]",
+        help="clarabel (default), qoco, ecos, or several to try in this order",
+    )
+
+
+def overrides(args: argparse.Namespace) -> dict[str, Value]:
+    """Parameters that the case changes, by name.
+
+    Raises:
+        InvalidInputError: A file that cannot be read, or an assignment that cannot be parsed.
+    """
+    from dscp_core.parameters import load_parameter_file
+
+    from_file = {} if args.vehicle is None else load_parameter_file(args.vehicle)
+    return {**from_file, **parse_assignments(args.assignments)}
+
+
+def parse_assignments(assignments: Sequence[str]) -> dict[str, Value]:
+    """Values of NAME=VALUE texts; names and bounds are checked where the values are used.
+
+    Raises:
+        InvalidInputError: No NAME=VALUE, a value that is no number, or a name given twice.
+    """
+    values: dict[str, Value] = {}
+    for assignment in assignments:
+        name, equals, text = (part.strip() for part in assignment.partition("="))
+        if not (name and equals and text):
+            raise InvalidInputError("--set", assignment, "NAME=VALUE")
+        if name in values:
+            raise InvalidInputError("--set", assignment, f"{name} set once")
+        try:
+            numbers = [float(part) for part in text.split(",")]
+        except ValueError:
+            raise InvalidInputError(name, text, "a number, or numbers as a,b,c") from None
+        values[name] = numbers if len(numbers) > 1 else numbers[0]
+    return values
+
+
+def planner_settings(args: argparse.Namespace, options: ScpOptions) -> PlannerSettings:
+    """Settings of the case.
+
+    Args:
+        args: Parsed arguments.
+        options: How to iterate; the solver comes from the arguments.
+
+    Raises:
+        InvalidInputError: A value that cannot be used.
+    """
+    from dataclasses import replace
+
+    from dscp_core.planner import PlannerSettings, TerminalTime
+
+    if not 2 <= args.intervals <= MOST_INTERVALS:
+        raise InvalidInputError("--intervals", args.intervals, f"[2, {MOST_INTERVALS}]")
+    if args.solver is not None:
+        options = replace(options, solver=args.solver)
+    return PlannerSettings(
+        problem=args.problem,
+        formulation=args.formulation,
+        parameters=overrides(args),
+        intervals=args.intervals,
+        terminal_time=TerminalTime.FREE if args.free_terminal_time else TerminalTime.FIXED,
+        options=options,
+    )
+
+
+def print_parameters(args: argparse.Namespace) -> None:
+    """Prints the parameters of the case.
+
+    Raises:
+        InvalidInputError: Unknown problem or formulation, or a bad value.
+    """
+    from dscp_core import problems
+
+    declared = problems.get(args.problem, args.formulation).table
+    changed = overrides(args)
+    of_case = declared.with_defaults(changed)
+    if args.json:
+        parameters = [_described(declared[p.name], p.default) for p in of_case.parameters]
+        print_json({"problem": args.problem, "parameters": parameters})
+        return
+    rows = [
+        (p.name, _text(p.default), p.unit, f"[{p.lower:g}, {p.upper:g}]", p.description)
+        for p in of_case.parameters
+    ]
+    value = "value" if changed else "default"
+    print_table(("name", value, "unit", "bounds", "description"), rows)
+
+
+def print_table(header: Sequence[str], rows: Sequence[Sequence[str]], indent: str = "") -> None:
+    """Prints columns, left-aligned, two spaces apart; an empty header for none."""
+    lines = [header, *rows] if header else rows
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    for row in lines:
+        cells = (cell.ljust(width) for cell, width in zip(row, widths, strict=True))
+        print((indent + "  ".join(cells)).rstrip())
+
+
+def print_json(value: Any) -> None:
+    """Prints strict JSON: null stands for numbers that are not finite."""
+    print(json.dumps(json_ready(value), allow_nan=False))
+
+
+def json_ready(value: Any) -> Any:
+    """The value made of what JSON knows: arrays as lists, NaN and infinity as null."""
+    if hasattr(value, "tolist"):
+        value = value.tolist()
+    if isinstance(value, Mapping):
+        return {str(key): json_ready(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [json_ready(item) for item in value]
+    if isinstance(value, Enum):
+        return value.name.lower()
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def _described(declared: Parameter, value: float | tuple[float, ...]) -> dict[str, Any]:
+    return {
+        "name": declared.name,
+        "default": declared.default,
+        "value": value,
+        "unit": declared.unit,
+        "lower": declared.lower,
+        "upper": declared.upper,
+        "description": declared.description,
+        "source": declared.source,
+    }
+
+
+def _text(value: float | tuple[float, ...]) -> str:
+    return ",".join(f"{number:.9g}" for number in (value if isinstance(value, tuple) else (value,)))

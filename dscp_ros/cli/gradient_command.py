@@ -1,0 +1,184 @@
+"""`dscp gradient`: differentiate a plan, without ROS."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from typing import TYPE_CHECKING
+
+from dscp_core.errors import InvalidInputError
+from dscp_ros.cli import ExitCode
+from dscp_ros.cli.arguments import (
+    add_case_arguments,
+    planner_settings,
+    print_json,
+    print_parameters,
+    print_table,
+)
+
+if TYPE_CHECKING:
+    from dscp_ros.cli.gradient_report import GradientReport, ParameterGradient
+
+DESCRIPTION = """\
+Differentiates a plan with respect to parameters of the vehicle, the mission or the algorithm.
+
+  --of final_mass   d m_N / d parameter, kg per unit: positive where more of it saves fuel
+  --of cost         d J / d parameter; for powered_descent J is minus the final mass, in kg
+  --of convergence  d (sum over k > 1 of |J_k - J_K|) / d parameter: how fast the iterations settle
+
+Methods:
+  unrolled   exact derivative of the K iterations (K: those to convergence, or --iterations)
+  implicit   derivative of the point that they converge to, whatever the way there
+
+The answer carries a verdict: trusted, or the reasons why not. --check compares with differences of
+the whole SCP at the same K, extrapolated; its uncertainty tells how much they are worth.
+"""
+
+EPILOG = """\
+examples:
+  dscp gradient powered_descent --of final_mass --wrt terminal_time --check
+  dscp gradient powered_descent --of final_mass --wrt initial_position specific_impulse --json
+  dscp gradient powered_descent --of final_mass --wrt thrust_max --free-terminal-time
+  dscp gradient powered_descent --of cost --wrt initial_mass --method implicit --check
+  dscp gradient powered_descent --of convergence --wrt trust_region_control \\
+      --set trust_region_control=1e-3,1e-3,1e-3 --iterations 6
+
+`dscp gradient powered_descent --list-parameters` lists the names. Units are SI.
+
+--json prints one object: gradient, trusted, reasons, and with --check central_difference and
+relative_error; each a number, for a vector parameter an array, and for several NAMEs an object by
+name. A relative error of an array's component is relative to its largest component. null: the
+difference cannot be had, or does not tell the derivative from zero; see notes.
+
+exit codes: 0 good, 2 bad input, 3 no plan to differentiate.
+"""
+
+# Enough for the nodal thrust to settle, which the optimum hardly depends on (powered descent).
+IMPLICIT_ITERATIONS = 40
+
+
+SYMBOLS = {"final_mass": "m_N", "cost": "J", "convergence": "sum |J_k - J_K|"}
+MOST_ITERATIONS = 1000
+MOST_REASONS_SHOWN = 5
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Declares the command."""
+    parser = subparsers.add_parser(
+        "gradient", help="differentiate a plan, without ROS", description=DESCRIPTION, epilog=EPILOG
+    )
+    add_case_arguments(parser)
+    group = parser.add_argument_group("gradient")
+    group.add_argument("--of", choices=tuple(SYMBOLS), help="what is differentiated")
+    group.add_argument(
+        "--wrt", nargs="+", default=(), metavar="NAME", help="with respect to these parameters"
+    )
+    group.add_argument(
+        "--method", choices=("unrolled", "implicit"), default="unrolled", help="default: unrolled"
+    )
+    group.add_argument(
+        "--iterations",
+        type=int,
+        metavar="K",
+        help=f"do exactly K iterations (default: to convergence; implicit: {IMPLICIT_ITERATIONS})",
+    )
+    group.add_argument(
+        "--check", action="store_true", help="compare with differences of the whole SCP"
+    )
+    group.add_argument(
+        "--step",
+        type=float,
+        metavar="H",
+        help="longest step of the differences, in the parameter's unit; shortened where an active "
+        "set changes within it (default: suits the parameter)",
+    )
+    group = parser.add_argument_group("output")
+    group.add_argument("--json", action="store_true", help="print the result as JSON on stdout")
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Plans, differentiates, checks, prints.
+
+    Returns:
+        The exit code.
+
+    Raises:
+        InvalidInputError: A value that cannot be used.
+    """
+    if args.list_parameters:
+        print_parameters(args)
+        return ExitCode.OK
+    _require(args)
+    from dscp_core.planner import Planner
+    from dscp_core.scp import ScpOptions
+    from dscp_ros.cli.gradient_report import check, differentiate
+
+    fixed = args.iterations
+    if fixed is None and args.method == "implicit":
+        fixed = IMPLICIT_ITERATIONS
+    planner = Planner(planner_settings(args, ScpOptions.for_gradients(fixed_iterations=fixed)))
+    names = tuple(dict.fromkeys(args.wrt))
+    for name in names:
+        planner.problem.table.slice(name)
+    trace = planner.scp.run(planner.check_state(planner.initial_state))
+    report = differentiate(planner.scp, trace, args.of, names, args.method)
+    if args.check and report.parameters:
+        report = check(planner.scp, trace, report, args.step)
+    if args.json:
+        print_json({"problem": args.problem, **report.as_dict()})
+    else:
+        _print(report)
+    return ExitCode.NO_PLAN if report.infeasible else ExitCode.OK
+
+
+def _require(args: argparse.Namespace) -> None:
+    """Refuses what can be refused before anything is computed."""
+    if args.of is None:
+        raise InvalidInputError("--of", None, f"one of {', '.join(SYMBOLS)}")
+    if not args.wrt:
+        raise InvalidInputError("--wrt", None, "one name or more; see --list-parameters")
+    if args.iterations is not None and not 1 <= args.iterations <= MOST_ITERATIONS:
+        raise InvalidInputError("--iterations", args.iterations, f"[1, {MOST_ITERATIONS}]")
+    if args.step is not None and not (math.isfinite(args.step) and args.step > 0.0):
+        raise InvalidInputError("--step", args.step, "finite and > 0")
+    if args.step is not None and not args.check:
+        raise InvalidInputError("--step", args.step, "given with --check only")
+
+
+def _print(report: GradientReport) -> None:
+    verdict = "trusted" if report.trusted else "NOT TRUSTED"
+    print(f"gradient of {report.of}, {report.method}, {report.iterations} iterations: {verdict}")
+    if report.value is not None:
+        print(f"  {SYMBOLS[report.of]} = {report.value:.9g} kg")
+    if report.parameters:
+        rows = [row for p in report.parameters for row in _rows(p)]
+        header = ["parameter", "gradient", ""]
+        if len(rows[0]) > len(header):
+            header += ["central difference", "uncertainty", "relative error", "step"]
+        print_table(header, rows, indent="  ")
+    for note in report.notes:
+        print(f"  note: {note}")
+    for reason in report.reasons[:MOST_REASONS_SHOWN]:
+        print(f"  reason: {reason}")
+    hidden = len(report.reasons) - MOST_REASONS_SHOWN
+    if hidden > 0:
+        print(f"  and {hidden} more reasons; see --json")
+
+
+def _rows(parameter: ParameterGradient) -> list[list[str]]:
+    unit = "kg" if parameter.unit == "1" else f"kg per {parameter.unit}"
+    rows = [
+        [parameter.label(component), f"{value: .9g}", unit]
+        for component, value in enumerate(parameter.values)
+    ]
+    if parameter.differences:
+        pairs = zip(parameter.differences, parameter.relative_errors, strict=True)
+        for row, (difference, error) in zip(rows, pairs, strict=True):
+            row += [
+                "-" if difference.value is None else f"{difference.value: .9g}",
+                "-" if difference.value is None else f"{difference.uncertainty:.0e}",
+                "-" if error is None else f"{error:.1e}",
+                f"{difference.step:.1e} ({difference.kind})",
+            ]
+    return rows

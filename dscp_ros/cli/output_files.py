@@ -1,0 +1,94 @@
+"""Files that commands write: complete, or not there."""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import json
+import os
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from dscp_core.errors import InvalidInputError
+from dscp_ros.cli.arguments import json_ready
+
+if TYPE_CHECKING:
+    from dscp_core.ocp import OptimalControlProblem
+    from dscp_core.plan import Plan
+
+
+def check_output_path(option: str, path: Path, suffixes: tuple[str, ...]) -> None:
+    """Refuses a path that cannot be written to, before the work is done.
+
+    Raises:
+        InvalidInputError: Another suffix, a missing directory, or a directory.
+    """
+    if path.suffix.lower() not in suffixes:
+        raise InvalidInputError(option, str(path), f"a file name ending in {' or '.join(suffixes)}")
+    if path.is_dir():
+        raise InvalidInputError(option, str(path), "a file, not a directory")
+    if not path.parent.is_dir():
+        raise InvalidInputError(option, str(path), "a file in an existing directory")
+
+
+@contextlib.contextmanager
+def complete_file(path: Path) -> Iterator[Path]:
+    """Gives a temporary path beside ``path``, which replaces ``path`` if the block succeeds.
+
+    Raises:
+        OSError: The file cannot be written or moved.
+    """
+    partial = path.with_name(f".{path.stem}.{os.getpid()}.partial{path.suffix}")
+    try:
+        yield partial
+        os.replace(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def write_csv(path: Path, header: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
+    """Writes a table; an empty cell stands for None.
+
+    Raises:
+        OSError: The file cannot be written.
+    """
+    with complete_file(path) as partial, partial.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(header)
+        writer.writerows(rows)
+
+
+def write_trajectory(
+    path: Path, plan: Plan, problem: OptimalControlProblem, description: Mapping[str, Any]
+) -> None:
+    """Writes a plan as CSV, one row per node, or as JSON with its description.
+
+    Raises:
+        OSError: The file cannot be written.
+    """
+    states = [f"{s.name}_{_unit_suffix(s.unit)}" for s in problem.states]
+    controls = [f"{c.name}_{_unit_suffix(c.unit)}" for c in problem.controls]
+    if path.suffix.lower() == ".csv":
+        nodes = zip(
+            plan.times_s.tolist(), plan.states.tolist(), plan.controls.tolist(), strict=True
+        )
+        write_csv(path, ("time_s", *states, *controls), ((t, *x, *u) for t, x, u in nodes))
+        return
+    content = {
+        **description,
+        "trajectory": {
+            "state_columns": states,
+            "control_columns": controls,
+            "times_s": plan.times_s,
+            "states": plan.states,
+            "controls": plan.controls,
+            "state_rates": plan.state_rates,
+        },
+    }
+    with complete_file(path) as partial:
+        partial.write_text(json.dumps(json_ready(content), allow_nan=False), encoding="utf-8")
+
+
+def _unit_suffix(unit: str) -> str:
+    return unit.replace("/", "_").replace("^", "").lower()

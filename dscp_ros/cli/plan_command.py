@@ -1,0 +1,284 @@
+"""`dscp plan`: solve one case, without ROS."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from dscp_core.errors import InvalidInputError
+from dscp_ros.cli import ExitCode
+from dscp_ros.cli.arguments import (
+    add_case_arguments,
+    planner_settings,
+    print_json,
+    print_parameters,
+    print_table,
+)
+from dscp_ros.cli.output_files import check_output_path, complete_file, write_trajectory
+
+if TYPE_CHECKING:
+    from dscp_core.plan import Plan, PlanOutcome
+    from dscp_core.planner import Planner
+    from dscp_core.verification import PlanCertificate
+
+DESCRIPTION = """\
+Plans one trajectory and certifies it: the true dynamics are integrated under the planned controls,
+and every constraint is checked between the nodes too. Without options it is the paper's case.
+
+Units are SI; x points up, and angles are in rad. A plan for which no certificate can be given is
+no plan: exit code 3.
+"""
+
+EPILOG = """\
+examples:
+  dscp plan powered_descent
+  dscp plan powered_descent --list-parameters
+  dscp plan powered_descent --set terminal_time=33 --set initial_position=5000,500,500
+  dscp plan powered_descent --free-terminal-time --solver qoco,clarabel
+  dscp plan powered_descent --plot plan.png --output plan.csv
+  dscp plan powered_descent --set terminal_time=32 --json    (infeasible: exit code 3)
+
+A vehicle file holds lines such as `initial_mass: 25000` and `initial_velocity: [-90, 0, 0]`.
+
+--json prints one object: status (certified, not_certified, infeasible, iteration_limit, deadline,
+solver_failure), message, terminal_time_s, final_mass_kg, iterations, certified, certificate,
+solve_time_ms, solver, virtual_control, max_defect, cost, least_feasible_terminal_time_s.
+null stands for what does not exist.
+
+exit codes: 0 certified plan, 2 bad input, 3 no such plan.
+"""
+
+_STATUS_WORDS = {
+    "certified": "certified",
+    "not_certified": "NOT CERTIFIED",
+    "infeasible": "INFEASIBLE",
+    "iteration_limit": "NO PLAN: iteration limit",
+    "deadline": "NO PLAN: deadline",
+    "solver_failure": "NO PLAN: solver failure",
+}
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Declares the command."""
+    parser = subparsers.add_parser(
+        "plan", help="solve one case, without ROS", description=DESCRIPTION, epilog=EPILOG
+    )
+    add_case_arguments(parser)
+    parser.add_argument(
+        "--deadline", type=float, metavar="S", help="wall time for the iterations, in seconds"
+    )
+    group = parser.add_argument_group("output")
+    group.add_argument(
+        "--plot", type=Path, metavar="FILE.png", help="draw the plan and the flight that checks it"
+    )
+    group.add_argument("--output", type=Path, metavar="FILE.csv|.json", help="write the trajectory")
+    group.add_argument("--json", action="store_true", help="print the result as JSON on stdout")
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Plans, prints, writes.
+
+    Returns:
+        The exit code.
+
+    Raises:
+        InvalidInputError: A value that cannot be used.
+    """
+    if args.list_parameters:
+        print_parameters(args)
+        return ExitCode.OK
+    _check(args)
+    from dscp_core.plan import PlanStatus
+    from dscp_core.planner import Planner
+    from dscp_core.scp import ScpOptions
+
+    planner = Planner(planner_settings(args, ScpOptions()))
+    planner.check_state(planner.initial_state)
+    outcome = planner.plan(planner.initial_state, deadline_s=args.deadline)
+    least = None
+    without_answer = outcome.status not in (PlanStatus.CERTIFIED, PlanStatus.DEADLINE)
+    if without_answer and not args.free_terminal_time:
+        least = _least_terminal_time(planner)
+        outcome = _name_least(outcome, least)
+    described = describe(planner, outcome, least)
+    written = _write(args, planner, outcome, described)
+    if args.json:
+        print_json({**described, **written})
+    else:
+        _print(described)
+    return ExitCode.OK if outcome.status is PlanStatus.CERTIFIED else ExitCode.NO_PLAN
+
+
+def describe(planner: Planner, outcome: PlanOutcome, least_s: float | None) -> dict[str, Any]:
+    """The outcome by name, in the units that the names tell.
+
+    Args:
+        planner: What made it.
+        outcome: What became of the attempt.
+        least_s: Least feasible terminal time, where it was looked for and found.
+    """
+    from dscp_core import problems
+    from dscp_core.plan import PlanStatus
+
+    settings, plan = planner.settings, _flyable(outcome)
+    formulation = settings.formulation or problems.formulations(settings.problem)[0]
+    return {
+        "problem": settings.problem,
+        "formulation": formulation,
+        "status": outcome.status,
+        "message": outcome.message,
+        "certified": outcome.status is PlanStatus.CERTIFIED,
+        "terminal_time_s": outcome.terminal_time_used_s,
+        "terminal_time_source": settings.terminal_time,
+        "least_feasible_terminal_time_s": least_s,
+        "final_mass_kg": None if plan is None else _final_mass(plan),
+        "cost": None if plan is None else outcome.cost,
+        "iterations": outcome.iterations,
+        "intervals": settings.intervals,
+        "solver": outcome.solver,
+        "solve_time_ms": 1e3 * outcome.solve_time_s,
+        "solver_time_ms": 1e3 * outcome.solver_time_s,
+        "virtual_control": outcome.virtual_control,
+        "max_defect": outcome.max_defect,
+        "certificate": None if outcome.certificate is None else _certificate(outcome.certificate),
+        "parameters": planner.problem.table.unpack(planner.parameters),
+    }
+
+
+def _check(args: argparse.Namespace) -> None:
+    """Refuses what can be refused before anything is computed."""
+    if args.deadline is not None and not (math.isfinite(args.deadline) and args.deadline > 0.0):
+        raise InvalidInputError("--deadline", args.deadline, "finite and > 0 s")
+    if args.plot is not None:
+        check_output_path("--plot", args.plot, (".png",))
+    if args.output is not None:
+        check_output_path("--output", args.output, (".csv", ".json"))
+
+
+def _least_terminal_time(planner: Planner) -> float | None:
+    """Least feasible terminal time, by the default formulation: the printed one cannot find it."""
+    from dscp_core.ocp import TERMINAL_TIME
+    from dscp_core.planner import Planner as DefaultPlanner
+
+    settings = replace(planner.settings, formulation=None)
+    others = {n: v for n, v in settings.parameters.items() if n != TERMINAL_TIME}
+    # The case's own time is the first guess; one that is far too short leads nowhere.
+    for parameters in (settings.parameters, others):
+        search = DefaultPlanner(replace(settings, parameters=parameters))
+        least = search.least_terminal_time(search.initial_state)
+        if least is not None:
+            return least
+    return None
+
+
+def _name_least(outcome: PlanOutcome, least_s: float | None) -> PlanOutcome:
+    """Says so where the terminal time is too short, however the iterations ended."""
+    from dscp_core.plan import PlanStatus
+
+    used = outcome.terminal_time_used_s
+    if least_s is None or used >= least_s:
+        return outcome
+    message = (
+        f"terminal_time {used:g} s is below the least feasible {least_s:.4f} s; {outcome.message}"
+    )
+    return replace(outcome, status=PlanStatus.INFEASIBLE, message=message)
+
+
+def _flyable(outcome: PlanOutcome) -> Plan | None:
+    """The trajectory, if it satisfies the dynamics."""
+    from dscp_core.plan import PlanStatus
+
+    kept = outcome.status in (PlanStatus.CERTIFIED, PlanStatus.NOT_CERTIFIED)
+    return outcome.plan if kept else None
+
+
+def _final_mass(plan: Plan) -> float:
+    return float(plan.states[-1, plan.state_names.index("mass")])
+
+
+def _certificate(certificate: PlanCertificate) -> dict[str, Any]:
+    worst = {check.name: check.worst_value for check in certificate.checks}
+    return {
+        "passed": certificate.passed,
+        "reasons": certificate.reasons,
+        # Missing where the flight could not be integrated to its end.
+        "miss_position_m": worst.get("miss_position"),
+        "miss_speed_m_s": worst.get("miss_speed"),
+        "mass_used_kg": certificate.mass_used_kg,
+        "control_hold": certificate.hold,
+        "checks": [asdict(check) for check in certificate.checks],
+    }
+
+
+def _write(
+    args: argparse.Namespace, planner: Planner, outcome: PlanOutcome, described: dict[str, Any]
+) -> dict[str, str | None]:
+    """Writes the files that were asked for; returns where they are, None for those left out."""
+    asked = {name: getattr(args, name) for name in ("output", "plot") if getattr(args, name)}
+    plan = _flyable(outcome)
+    if plan is None or outcome.certificate is None:
+        for name, path in asked.items():
+            print(f"dscp plan: --{name}: no trajectory, {path} is not written", file=sys.stderr)
+        return dict.fromkeys(asked)
+    if args.output is not None:
+        write_trajectory(args.output, plan, planner.problem, described)
+    if args.plot is not None:
+        from dscp_core.plotting import plan_figure
+
+        figure = plan_figure(
+            plan, outcome.certificate, planner.problem.table.unpack(planner.parameters)
+        )
+        with complete_file(args.plot) as partial:
+            figure.savefig(partial)
+    return {name: str(path) for name, path in asked.items()}
+
+
+def _print(described: dict[str, Any]) -> None:
+    status, certificate = described["status"], described["certificate"]
+    print(
+        f"{described['problem']} ({described['formulation']}, {described['intervals']} intervals): "
+        f"{_STATUS_WORDS[status.name.lower()]}"
+    )
+    rows = [
+        (
+            "terminal time",
+            f"{described['terminal_time_s']:.4f} s",
+            described["terminal_time_source"].value,
+        )
+    ]
+    if described["least_feasible_terminal_time_s"] is not None:
+        rows.append(("least feasible", f"{described['least_feasible_terminal_time_s']:.4f} s", ""))
+    if described["final_mass_kg"] is not None:
+        used = certificate["mass_used_kg"]
+        rows.append(("final mass", f"{described['final_mass_kg']:.3f} kg", f"{used:.3f} kg used"))
+    rows.append(
+        (
+            "iterations",
+            str(described["iterations"]),
+            f"{described['solve_time_ms']:.1f} ms, of which "
+            f"{described['solver_time_ms']:.1f} ms in {described['solver']}",
+        )
+    )
+    for label, value, note in rows:
+        print(f"  {label:<15}{value:>14}  {note}".rstrip())
+    if status.name != "CERTIFIED":
+        print(f"  {described['message']}")
+    if described["final_mass_kg"] is None:
+        return
+    print("  certificate, flown with the controls held at interval means:")
+    checks = [
+        (
+            check["name"],
+            f"{check['worst_value']:.4g}",
+            f"{check['bound']:g} {check['unit']}",
+            f"{check['time_s']:.2f} s",
+            "passed" if check["passed"] else "FAILED",
+        )
+        for check in certificate["checks"]
+    ]
+    print_table(("check", "worst", "bound", "at", ""), checks, indent="    ")

@@ -1,0 +1,1 @@
+"""The demonstration: `python -m dscp_ros.demo --output DIR`."""

@@ -1,0 +1,75 @@
+"""One recorded plan: read back, flown again, and checked against what was reported with it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from dscp_core import problems
+from dscp_core.plan import Plan
+from dscp_core.verification import PlanCertificate, PlanVerifier
+from dscp_ros.bag import BagReader
+from dscp_ros.demo.session import TRAJECTORY
+from dscp_ros.demo.summary import Figures
+from msg_adapters.frames import POWERED_DESCENT, state_layout
+from msg_adapters.report import PlanReport
+from msg_adapters.stamps import nanoseconds_from_stamp
+from msg_adapters.trajectory import plan_from_trajectory
+
+
+@dataclass(frozen=True)
+class Landing:
+    """A published plan.
+
+    Attributes:
+        plan: As published.
+        report: As published.
+        certificate: Of the plan as it was read back.
+        parameters: Vehicle and mission that it was made for, SI, by name.
+    """
+
+    plan: Plan
+    report: PlanReport
+    certificate: PlanCertificate
+    parameters: Mapping[str, Any]
+
+    @property
+    def start_text(self) -> str:
+        """Where the plan starts, for people."""
+        state = self.report.state
+        return (
+            f"{state['z']:.0f} m up, {math.hypot(state['x'], state['y']):.0f} m aside, "
+            f"at {math.hypot(state['vx'], state['vy'], state['vz']):.0f} m/s"
+        )
+
+
+def recorded_landing(recording: Path, parts: Sequence[Figures]) -> Landing | None:
+    """The first plan that was published for the last bag with plans; None without any.
+
+    Raises:
+        BagError: The recording cannot be read.
+        RejectedInputError: A trajectory cannot be understood.
+    """
+    published = [[r for r in part.attempts if r.published] for part in parts]
+    reports = {r.input_stamp_ns: r for r in next((p for p in reversed(published) if p), [])}
+    problem = problems.get(POWERED_DESCENT)
+    layout = state_layout(problem.name, [state.name for state in problem.states])
+    with BagReader(recording) as reader:
+        for _, message in reader.decoded_messages([TRAJECTORY]):
+            report = reports.get(nanoseconds_from_stamp(message.header.stamp))
+            if report is None:
+                continue
+            plan, _ = plan_from_trajectory(
+                message,
+                layout,
+                control_names=[control.name for control in problem.controls],
+                control_states=problem.control_states,
+            )
+            packed = problem.table.pack()
+            verifier = PlanVerifier(problem, len(plan.times_s) - 1)
+            certificate = verifier.certify(plan.times_s, plan.states, plan.controls, packed)
+            return Landing(plan, report, certificate, problem.table.unpack(packed))
+    return None

@@ -1,0 +1,184 @@
+"""Entry point of the planner node: arguments, signals, the executor's loop, a clean end."""
+
+from __future__ import annotations
+
+import argparse
+import gc
+import os
+import signal
+import sys
+import threading
+from collections.abc import Sequence
+from types import FrameType
+from typing import TYPE_CHECKING, Any
+
+from dscp_core.errors import InvalidInputError
+from dscp_ros.cli import ExitCode
+
+if TYPE_CHECKING:
+    from rclpy.executors import Executor
+
+    from dscp_ros.planner.node import PlannerNode
+
+NODE_NAME = "planner"
+
+DESCRIPTION = """\
+Run the planner as a ROS 2 node (default name: /planner).
+
+in   ~/state          nav_msgs/Odometry            position, velocity (twist in the child frame)
+     ~/mass           geometry_msgs/InertiaStamped mass that completes ~/state
+     ~/vehicle_state  sensor_msgs/JointState       or: x y z vx vy vz mass in one message
+out  ~/trajectory     trajectory_msgs/JointTrajectory   certified plans only
+     ~/path           nav_msgs/Path
+     ~/markers        visualization_msgs/MarkerArray
+     ~/report         diagnostic_msgs/DiagnosticArray   one per attempt or refused input
+     /diagnostics     diagnostic_msgs/DiagnosticArray   health, once a second
+srv  ~/plan, ~/reset, ~/reload                     std_srvs/Trigger
+"""
+
+EPILOG = """\
+examples:
+  dscp planner
+  dscp planner --params-file config/powered_descent.yaml
+  dscp planner --ros-args -p deadline_s:=0.1 -r '~/state:=/vehicle/odometry'
+
+exit codes: 0 ended by SIGINT or SIGTERM, 2 bad arguments or parameters.
+"""
+
+_SPIN_S = 0.1
+"""Longest wait for work; a signal is noticed no later than this."""
+
+_STOP_S = 3.0
+"""Longest wait for the attempt in hand at the end; launch files send SIGKILL after 5 to 10 s."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command line."""
+    parser.add_argument(
+        "--params-file",
+        metavar="FILE",
+        action="append",
+        default=[],
+        help="ROS parameter file (YAML); may be given several times, later ones win",
+    )
+    parser.add_argument(
+        "--ros-args",
+        nargs=argparse.REMAINDER,
+        default=[],
+        help="everything that follows is for ROS: remappings (-r), parameters (-p), log level",
+    )
+
+
+def ros_arguments(args: argparse.Namespace) -> list[str]:
+    """ROS command line of parsed arguments."""
+    files = [word for path in args.params_file for word in ("--params-file", path)]
+    words = [*files, *args.ros_args]
+    return ["--ros-args", *words] if words else []
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the node until a signal ends it.
+
+    Args:
+        argv: Arguments after the program's name; the process's own by default.
+
+    Returns:
+        Exit code.
+    """
+    parser = argparse.ArgumentParser(
+        prog=NODE_NAME,
+        description=DESCRIPTION,
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
+    )
+    add_arguments(parser)
+    try:
+        return run(ros_arguments(parser.parse_args(argv)))
+    except InvalidInputError as error:
+        print(f"{NODE_NAME}: error: {error}", file=sys.stderr)
+        return ExitCode.BAD_INPUT
+
+
+def run(arguments: Sequence[str]) -> int:
+    """Run the node with a ROS command line, as the last thing that a process does.
+
+    Returns:
+        Exit code 0, after SIGINT or SIGTERM.
+
+    Raises:
+        InvalidInputError: Bad arguments or parameters.
+    """
+    stop = threading.Event()
+
+    def request_stop(_signal: int, _frame: FrameType | None) -> None:
+        stop.set()
+
+    # Before the imports below, which take most of a second; rclpy's own handlers end the context
+    # under the worker's feet, and lose a SIGTERM that comes to an idle executor.
+    previous = {
+        number: signal.signal(number, request_stop) for number in (signal.SIGINT, signal.SIGTERM)
+    }
+    after: dict[signal.Signals, Any] = previous
+    try:
+        code = _run(arguments, stop)
+        # A second Ctrl-C must not turn a clean end into a killed process.
+        after = dict.fromkeys(previous, signal.SIG_IGN)
+        return code
+    finally:
+        for number, handler in after.items():
+            signal.signal(number, handler)
+
+
+def _run(arguments: Sequence[str], stop: threading.Event) -> int:
+    import rclpy
+    from rclpy.executors import SingleThreadedExecutor
+    from rclpy.node import Node
+    from rclpy.signals import SignalHandlerOptions
+    from rclpy.utilities import try_shutdown
+
+    from dscp_ros.planner.node import PlannerNode
+    from dscp_ros.planner.parameter_files import check_files, parameter_arguments
+
+    sources = parameter_arguments(arguments)
+    check_files(sources)
+    try:
+        rclpy.init(args=list(arguments), signal_handler_options=SignalHandlerOptions.NO)
+    except RuntimeError as error:
+        raise InvalidInputError("ROS arguments", list(arguments), f"rcl: {error}") from None
+    try:
+        executor = SingleThreadedExecutor()
+        node = Node(NODE_NAME)
+        planner = PlannerNode(node, sources)
+        executor.add_node(node)
+        # Otherwise the collector walks all that was imported so far, for milliseconds, again and
+        # again while plans are made.
+        gc.collect()
+        gc.freeze()
+        _spin(executor, planner, stop)
+        if not planner.close(_STOP_S):
+            node.get_logger().warning(f"a plan is left after {_STOP_S:g} s, unfinished")
+            # Tearing ROS and Python down under a running solver may crash either.
+            os._exit(ExitCode.OK)
+        executor.shutdown()
+        node.destroy_node()
+    finally:
+        try_shutdown()
+    return ExitCode.OK
+
+
+def _spin(executor: Executor, planner: PlannerNode, stop: threading.Event) -> None:
+    """Serve callbacks until told to stop; an exception in one of them does not end the node."""
+    from rclpy.executors import ExternalShutdownException
+
+    while not stop.is_set():
+        try:
+            executor.spin_once(timeout_sec=_SPIN_S)
+        except ExternalShutdownException:
+            return
+        except Exception as error:  # noqa: BLE001 - reported; the node lives on
+            planner.report_internal_error(error)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

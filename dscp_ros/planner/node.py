@@ -1,0 +1,328 @@
+"""The planner node: topics, services and the clock. It wires; it decides nothing numerical.
+
+Everything here runs in the executor's thread and returns at once; plans are made by a worker.
+"""
+
+from __future__ import annotations
+
+import time
+import traceback
+from collections.abc import Callable
+from concurrent.futures import CancelledError, Future
+from typing import Any
+
+from geometry_msgs.msg import InertiaStamped
+from nav_msgs.msg import Odometry
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.clock import Clock, JumpThreshold, TimeJump
+from rclpy.clock_type import ClockType
+from rclpy.duration import Duration
+from rclpy.node import Node
+from rclpy.qos import QoSProfile, QoSReliabilityPolicy
+from rclpy.task import Future as RosFuture
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Header
+from std_srvs.srv import Trigger
+
+from dscp_core.errors import DscpError
+from dscp_core.planner import PlannerSettings
+from dscp_ros.planner.attempts import AttemptRunner, PlanJob, Surroundings
+from dscp_ros.planner.events import ThrottledLog, event_report, refusal_report
+from dscp_ros.planner.health import HealthMonitor
+from dscp_ros.planner.input_checks import FROM_PARAMETER, AcceptedState, InputGate, InputSettings
+from dscp_ros.planner.outputs import PlanOutputs
+from dscp_ros.planner.parameter_files import ParameterArguments
+from dscp_ros.planner.parameter_server import ParameterServer
+from dscp_ros.planner.parameters import RELIABLE, NodeSettings, problem_layout
+from dscp_ros.planner.session import PlanningSession
+from dscp_ros.planner.worker import MailboxWorker
+from msg_adapters.errors import InputCode, RejectedInputError
+from msg_adapters.report import NodeCode, PlanReport
+from msg_adapters.stamps import nanoseconds_from_stamp
+
+_HEALTH_PERIOD_S = 1.0
+_MASS_DEPTH = 10
+"""Masses come seldom and in bursts with states; unlike states, none should be skipped."""
+
+Accept = Callable[[Any, int, InputSettings], AcceptedState]
+
+
+class PlannerNode:
+    """Has states planned from, and serves ``~/plan``, ``~/reset``, ``~/reload``."""
+
+    def __init__(self, node: Node, arguments: ParameterArguments) -> None:
+        """Declare parameters, compile the problem, and open the topics.
+
+        Args:
+            node: Node to live on.
+            arguments: Where the command line takes parameters from.
+
+        Raises:
+            InvalidInputError: A parameter is misspelt or out of range.
+        """
+        self._node = node
+        self._parameters = ParameterServer(node, arguments)
+        settings = self._parameters.settings
+        layout = problem_layout(self._parameters.problem)
+        self._problem = layout.problem
+        self._session = PlanningSession(settings.planner)
+        self._requested: PlannerSettings | None = settings.planner
+        self._gate = InputGate(layout)
+        self._health = HealthMonitor()
+        self._warnings = ThrottledLog(node.get_logger().warning)
+        self._outputs = PlanOutputs(node, layout, frame=settings.inputs.frame)
+        self._last: AcceptedState | None = None
+        surroundings = Surroundings(
+            now_ns=self._now_ns,
+            settings=lambda: self._parameters.settings,
+            drops=lambda: self._worker.drops,
+            rejected=lambda: self._gate.rejected.total(),
+            log_error=node.get_logger().error,
+            log_warning=self._warn,
+        )
+        self._runner = AttemptRunner(
+            self._session, self._outputs, self._health, layout, surroundings
+        )
+        self._worker: MailboxWorker[PlanJob] = MailboxWorker(self._runner.run, name="planner")
+        self._parameters.on_change(self._on_settings)
+        self._open(settings)
+        node.get_logger().info(
+            f"planning {self._problem} with {settings.planner.options.solver}, "
+            f"{settings.planner.intervals} intervals, from states in {settings.inputs.frame}"
+        )
+
+    def close(self, timeout_s: float) -> bool:
+        """End the worker after the attempt in hand.
+
+        Returns:
+            Whether it ended in time.
+        """
+        self._runner.new_epoch()
+        self._jump_handle.unregister()
+        return self._worker.stop(timeout_s)
+
+    def report_internal_error(self, error: Exception) -> None:
+        """Report an exception that a callback let through."""
+        message = f"{type(error).__name__}: {error}"
+        trace = "".join(traceback.format_exception(error))
+        self._warn(NodeCode.INTERNAL_ERROR, f"a callback failed, the node lives on: {trace}")
+        self._outputs.publish_report(self._event(NodeCode.INTERNAL_ERROR, message, "callback"))
+
+    def _open(self, settings: NodeSettings) -> None:
+        """Create subscriptions, services and the health timer."""
+        node = self._node
+        reliability = (
+            QoSReliabilityPolicy.RELIABLE
+            if settings.state_reliability == RELIABLE
+            else QoSReliabilityPolicy.BEST_EFFORT
+        )
+        newest = QoSProfile(depth=1, reliability=reliability)
+        few = QoSProfile(depth=_MASS_DEPTH, reliability=reliability)
+        node.create_subscription(Odometry, "~/state", self._on_state, newest)
+        node.create_subscription(InertiaStamped, "~/mass", self._on_mass, few)
+        node.create_subscription(JointState, "~/vehicle_state", self._on_vehicle_state, newest)
+        # Services wait for the worker; in a group of their own they hold up nothing else.
+        group = ReentrantCallbackGroup()
+        for name, callback in (
+            ("~/plan", self._on_plan),
+            ("~/reset", self._on_reset),
+            ("~/reload", self._on_reload),
+        ):
+            node.create_service(Trigger, name, callback, callback_group=group)
+        # Health is told by a steady clock: a simulation that stands still is still alive.
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        node.create_timer(_HEALTH_PERIOD_S, self._publish_health, clock=steady)
+        threshold = JumpThreshold(
+            min_forward=None, min_backward=Duration(nanoseconds=-1), on_clock_change=True
+        )
+        self._jump_handle = node.get_clock().create_jump_callback(
+            threshold, post_callback=self._on_clock_jump
+        )
+
+    # Inputs
+
+    def _on_state(self, message: Odometry) -> None:
+        self._take("state", message, self._gate.accept_odometry)
+
+    def _on_vehicle_state(self, message: JointState) -> None:
+        self._take("vehicle_state", message, self._gate.accept_joint_state)
+
+    def _on_mass(self, message: InertiaStamped) -> None:
+        self._gate.received += 1
+        try:
+            self._gate.accept_mass(message, self._now_ns(), self._parameters.settings.inputs)
+        except RejectedInputError as error:
+            self._refuse(error, "mass", message.header)
+
+    def _take(self, source: str, message: Any, accept: Accept) -> None:
+        arrived_s = time.perf_counter()
+        self._gate.received += 1
+        try:
+            accepted = accept(message, self._now_ns(), self._parameters.settings.inputs)
+        except RejectedInputError as error:
+            self._refuse(error, source, message.header)
+            return
+        if accepted.mass_source == FROM_PARAMETER:
+            self._warn(InputCode.MASS_STALE, "no fresh mass message: using mass_fallback_kg")
+        self._last = accepted
+        self._health.note_input()
+        self._worker.submit(PlanJob(accepted, source, arrived_s, self._runner.epoch))
+
+    def _refuse(self, error: RejectedInputError, source: str, header: Header | None) -> None:
+        self._gate.rejected[error.code] += 1
+        self._warn(error.code, f"{source} refused: {error}")
+        report = refusal_report(
+            error,
+            stamp_ns=self._now_ns(),
+            source=source,
+            problem=self._problem,
+            drops=self._worker.drops,
+            rejected=self._gate.rejected.total(),
+            input_stamp_ns=_stamp_or_none(header),
+        )
+        self._outputs.publish_report(report)
+
+    # Services
+
+    async def _on_plan(
+        self, _request: Trigger.Request, response: Trigger.Response
+    ) -> Trigger.Response:
+        """Plan now from the last accepted state, and answer with what became of it."""
+        try:
+            last = self._fresh_state()
+        except RejectedInputError as error:
+            self._refuse(error, "plan", None)
+            return _answer(response, False, str(error))
+        report = self._runner.next_report()
+        self._worker.submit(PlanJob(last, "plan", time.perf_counter(), self._runner.epoch))
+        await self._finished(report)
+        if report.cancelled():
+            return _answer(response, False, "reset before the plan was made")
+        result = report.result()
+        return _answer(response, result.published, f"{result.code_name}: {result.message}")
+
+    def _fresh_state(self) -> AcceptedState:
+        if self._last is None:
+            raise RejectedInputError(
+                InputCode.STATE_MISSING, "state", None, "a state on ~/state or ~/vehicle_state"
+            )
+        inputs = self._parameters.settings.inputs
+        self._gate.check_still_fresh(self._last.state, self._now_ns(), inputs)
+        return self._last
+
+    async def _on_reset(
+        self, _request: Trigger.Request, response: Trigger.Response
+    ) -> Trigger.Response:
+        """Forget warm start, stamps and mass."""
+        await self._finished(self._forget())
+        return _answer(response, True, "warm start, stamps and mass forgotten")
+
+    async def _on_reload(
+        self, _request: Trigger.Request, response: Trigger.Response
+    ) -> Trigger.Response:
+        """Read the parameter files again and rebuild the planner; on failure keep the old one."""
+        try:
+            change = self._parameters.reread_files()
+            planner = change.settings.planner
+            rebuilt = self._worker.call(lambda: self._session.rebuild(planner))
+            await self._finished(rebuilt)
+            rebuilt.result()
+            self._requested = planner
+            self._parameters.commit(change)
+        except (DscpError, CancelledError) as error:
+            self._node.get_logger().error(f"reload refused: {error}")
+            return _answer(response, False, f"the old parameters stay: {error}")
+        self._health.note_configuration(None)
+        return _answer(response, True, f"{len(change.values)} parameters read, planner rebuilt")
+
+    async def _finished(self, future: Future[Any]) -> None:
+        """Let the executor go on until a future of the worker is settled."""
+        executor = self._node.executor
+        assert executor is not None  # it is the executor that runs this
+        settled = RosFuture(executor=executor)
+
+        def settle(_future: Future[Any]) -> None:
+            settled.set_result(None)
+            executor.wake()
+
+        future.add_done_callback(settle)
+        await settled
+
+    # Parameters, clock, health
+
+    def _on_settings(self, settings: NodeSettings) -> None:
+        """Rebuild the planner where a changed parameter concerns it."""
+        if settings.planner == self._requested:
+            return
+        self._requested = settings.planner
+        rebuilt = self._worker.call(lambda: self._session.rebuild(settings.planner))
+        rebuilt.add_done_callback(self._note_rebuild)
+
+    def _note_rebuild(self, rebuilt: Future[Any]) -> None:
+        if rebuilt.cancelled():
+            return
+        error = rebuilt.exception()
+        if error is None:
+            self._node.get_logger().info("planner rebuilt with the new parameters")
+            self._health.note_configuration(None)
+            return
+        self._requested = None
+        self._node.get_logger().error(f"new parameters refused, the old planner stays: {error}")
+        self._health.note_configuration(str(error))
+
+    def _on_clock_jump(self, jump: TimeJump) -> None:
+        """Begin anew when the clock was set back, by a simulation's reset or a bag's loop."""
+        self._forget()
+        jump_s = jump.delta.nanoseconds / 1e9
+        message = f"the clock jumped by {jump_s:.3f} s: warm start, stamps and mass forgotten"
+        self._node.get_logger().warning(message)
+        self._outputs.publish_report(self._event(NodeCode.CLOCK_JUMPED_BACK, message, "clock"))
+
+    def _event(self, code: NodeCode, message: str, source: str) -> PlanReport:
+        return event_report(
+            code, message, stamp_ns=self._now_ns(), source=source, problem=self._problem
+        )
+
+    def _forget(self) -> Future[Any]:
+        """Forget everything that belongs to the time before now."""
+        self._runner.new_epoch()
+        self._worker.clear()
+        self._gate.forget()
+        self._last = None
+        return self._worker.call(self._forget_plan)
+
+    def _forget_plan(self) -> None:
+        self._session.forget()
+        self._outputs.clear_drawing(self._now_ns())
+
+    def _publish_health(self) -> None:
+        health = self._health.health(
+            received=self._gate.received,
+            rejected=self._gate.rejected,
+            drops=self._worker.drops,
+            worker_alive=self._worker.alive,
+            max_age_s=self._parameters.settings.inputs.state_max_age_s,
+        )
+        self._outputs.publish_health(health, self._now_ns())
+
+    def _warn(self, cause: int, text: str) -> None:
+        self._warnings.write(cause, text, self._parameters.settings.log_period_s)
+
+    def _now_ns(self) -> int:
+        return int(self._node.get_clock().now().nanoseconds)
+
+
+def _answer(response: Trigger.Response, success: bool, message: str) -> Trigger.Response:
+    response.success = success
+    response.message = message
+    return response
+
+
+def _stamp_or_none(header: Header | None) -> int | None:
+    """Stamp of a refused input, where it has a valid one."""
+    if header is None:
+        return None
+    try:
+        return nanoseconds_from_stamp(header.stamp)
+    except RejectedInputError:
+        return None

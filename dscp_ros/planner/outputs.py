@@ -1,0 +1,94 @@
+"""The node's topics: latched, so that whoever comes later sees the last plan and reports."""
+
+from __future__ import annotations
+
+from diagnostic_msgs.msg import DiagnosticArray
+from nav_msgs.msg import Path
+from rclpy.node import Node
+from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy
+from trajectory_msgs.msg import JointTrajectory
+from visualization_msgs.msg import MarkerArray
+
+from dscp_core.plan import Plan
+from msg_adapters.diagnostics import Health, message_from_health
+from msg_adapters.frames import StateLayout
+from msg_adapters.report import PlanReport
+from msg_adapters.report_message import message_from_report
+from msg_adapters.trajectory import TrajectoryEncoder
+from msg_adapters.visualisation import (
+    MarkerStyle,
+    markers_from_plan,
+    no_markers,
+    path_from_plan,
+)
+
+_REPORT_DEPTH = 50
+"""Reports kept for late and slow subscribers: every attempt has its report, in bursts too."""
+
+
+def latched(depth: int) -> QoSProfile:
+    """Reliable, and kept for subscribers that come later."""
+    return QoSProfile(
+        depth=depth,
+        reliability=QoSReliabilityPolicy.RELIABLE,
+        durability=QoSDurabilityPolicy.TRANSIENT_LOCAL,
+    )
+
+
+class PlanOutputs:
+    """Publishers of plans, reports and health."""
+
+    def __init__(self, node: Node, layout: StateLayout, *, frame: str) -> None:
+        """Create the publishers.
+
+        Args:
+            node: Node to publish from.
+            layout: Names and order of the problem's state.
+            frame: Landing frame.
+        """
+        self._name = node.get_fully_qualified_name().lstrip("/")
+        self._layout = layout
+        self._frame = frame
+        self._encoder: TrajectoryEncoder | None = None
+        self._trajectory = node.create_publisher(JointTrajectory, "~/trajectory", latched(1))
+        self._path = node.create_publisher(Path, "~/path", latched(1))
+        self._markers = node.create_publisher(MarkerArray, "~/markers", latched(1))
+        self._report = node.create_publisher(DiagnosticArray, "~/report", latched(_REPORT_DEPTH))
+        self._health = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
+
+    def publish_trajectory(self, plan: Plan, stamp_ns: int) -> None:
+        """Publish what a controller follows. Not for several threads at once.
+
+        Raises:
+            RejectedInputError: The plan holds NaN; nothing is published.
+        """
+        nodes = len(plan.times_s)
+        if self._encoder is None or self._encoder.nodes != nodes:
+            self._encoder = TrajectoryEncoder(self._layout, nodes, frame=self._frame)
+        self._trajectory.publish(self._encoder.encode(plan, stamp_ns))
+
+    def publish_drawing(self, plan: Plan, stamp_ns: int, style: MarkerStyle) -> None:
+        """Publish what people look at.
+
+        Raises:
+            RejectedInputError: The plan holds NaN; nothing is published.
+        """
+        path = path_from_plan(plan, stamp_ns, frame=self._frame)
+        markers = markers_from_plan(plan, stamp_ns, style, frame=self._frame)
+        self._path.publish(path)
+        self._markers.publish(markers)
+
+    def clear_drawing(self, stamp_ns: int) -> None:
+        """Remove every marker: there is no plan."""
+        self._markers.publish(no_markers(stamp_ns, frame=self._frame))
+
+    def publish_report(self, report: PlanReport) -> None:
+        """Publish what became of an input or attempt."""
+        self._report.publish(message_from_report(report, node=self._name, frame=self._frame))
+
+    def publish_health(self, health: Health, stamp_ns: int) -> None:
+        """Publish the node's health."""
+        message = message_from_health(
+            health, stamp_ns, node=self._name, problem=self._layout.problem
+        )
+        self._health.publish(message)

@@ -1,0 +1,1 @@
+"""Replaying a bag on real ROS 2 topics with its own timing."""

@@ -1,0 +1,105 @@
+"""Typed values as the text pairs of diagnostic_msgs/DiagnosticStatus.
+
+Floats are written by ``repr``, so reading them back gives the same bits. A value that is None, or
+a float that is NaN or infinite, is left out: a missing key means "not known".
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+
+from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
+
+from msg_adapters.errors import InputCode, RejectedInputError
+
+Value = bool | int | float | str | None
+
+
+def key_values(pairs: Iterable[tuple[str, Value]]) -> list[KeyValue]:
+    """Pairs as text; unknown values are left out."""
+    return [
+        KeyValue(key=key, value=text)
+        for key, text in ((key, _text(value)) for key, value in pairs)
+        if text is not None
+    ]
+
+
+def _text(value: Value) -> str | None:
+    if value is None:
+        return None
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, int):
+        return str(int(value))
+    if isinstance(value, str):
+        return value
+    return repr(float(value)) if math.isfinite(value) else None
+
+
+class KeyValueReader:
+    """Reads typed values out of a status; every failure names the key."""
+
+    def __init__(self, status: DiagnosticStatus) -> None:
+        """Index the status's keys; of a key given twice the last one counts."""
+        self.texts: Mapping[str, str] = {pair.key: pair.value for pair in status.values}
+
+    def text(self, key: str) -> str:
+        """Text of a key.
+
+        Raises:
+            RejectedInputError: REPORT_MISSING_KEY.
+        """
+        if key not in self.texts:
+            raise RejectedInputError(
+                InputCode.REPORT_MISSING_KEY, "values", sorted(self.texts), f"a key '{key}'"
+            )
+        return self.texts[key]
+
+    def integer(self, key: str) -> int:
+        """Whole number.
+
+        Raises:
+            RejectedInputError: REPORT_MISSING_KEY or REPORT_BAD_VALUE.
+        """
+        text = self.text(key)
+        try:
+            return int(text)
+        except ValueError:
+            raise self._bad(key, text, "a whole number") from None
+
+    def boolean(self, key: str) -> bool:
+        """Truth value.
+
+        Raises:
+            RejectedInputError: REPORT_MISSING_KEY or REPORT_BAD_VALUE.
+        """
+        text = self.text(key)
+        if text not in ("true", "false"):
+            raise self._bad(key, text, "true or false")
+        return text == "true"
+
+    def optional_text(self, key: str) -> str | None:
+        """Text, or None where the key is missing."""
+        return self.texts.get(key)
+
+    def optional_number(self, key: str) -> float | None:
+        """Finite number, or None where the key is missing.
+
+        Raises:
+            RejectedInputError: REPORT_BAD_VALUE.
+        """
+        text = self.texts.get(key)
+        if text is None:
+            return None
+        try:
+            value = float(text)
+        except ValueError:
+            raise self._bad(key, text, "a number") from None
+        if not math.isfinite(value):
+            raise self._bad(key, text, "finite")
+        return value
+
+    @staticmethod
+    def _bad(key: str, text: str, bound: str) -> RejectedInputError:
+        return RejectedInputError(InputCode.REPORT_BAD_VALUE, key, text, bound)

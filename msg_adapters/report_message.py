@@ -1,0 +1,227 @@
+"""diagnostic_msgs/DiagnosticArray: the planner node's report, both ways.
+
+One status per message. Keys without a known value are left out. Keys:
+
+- always: ``code``, ``code_name``, ``source``, ``published``, ``drops``, ``rejected``
+- if known: ``input_stamp`` (seconds.nanoseconds), ``latency_ms``, ``mass_source``, ``state.NAME``
+- after an attempt: ``iterations``, ``solve_time_ms``, ``solver_time_ms``, ``deadline_ms``,
+  ``virtual_control``, ``max_defect``, ``cost``, ``terminal_time_predicted_s``,
+  ``terminal_time_used_s``, ``warm_started``, ``solver``
+- with a certificate: ``certificate.passed``, ``certificate.reason.K``,
+  ``certificate.miss_position_m``, ``certificate.miss_speed_m_s``, ``certificate.mass_used_kg``,
+  ``certificate.check.K.FIELD`` with the fields of `report.CheckFigures`
+- after a refusal: ``field``, ``value``, ``bound``
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import count
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+
+from msg_adapters.checks import require_length
+from msg_adapters.errors import InputCode, RejectedInputError
+from msg_adapters.key_values import KeyValueReader, Value, key_values
+from msg_adapters.report import (
+    AttemptFigures,
+    CertificateFigures,
+    CheckFigures,
+    NodeCode,
+    PlanReport,
+    Rejection,
+)
+from msg_adapters.stamps import (
+    nanoseconds_from_stamp,
+    nanoseconds_from_stamp_text,
+    stamp_from_nanoseconds,
+    stamp_text,
+)
+
+_CERTIFIED = 0
+_SOLVER_FAILURE = 5
+_STATE = "state."
+_REASON = "certificate.reason."
+_CHECK = "certificate.check."
+_NUMBERS = (
+    "solve_time_ms",
+    "solver_time_ms",
+    "deadline_ms",
+    "virtual_control",
+    "max_defect",
+    "cost",
+    "terminal_time_predicted_s",
+    "terminal_time_used_s",
+)
+_CERTIFICATE_NUMBERS = ("miss_position_m", "miss_speed_m_s", "mass_used_kg")
+_CHECK_NUMBERS = ("worst_value", "bound", "time_s")
+
+
+def level_of(code: int) -> bytes:
+    """Diagnostic level of a code: OK for a certified plan, ERROR for failures of the software."""
+    level = DiagnosticStatus.WARN
+    if code == _CERTIFIED:
+        level = DiagnosticStatus.OK
+    elif code in (_SOLVER_FAILURE, NodeCode.INTERNAL_ERROR):
+        level = DiagnosticStatus.ERROR
+    return bytes(level)
+
+
+def message_from_report(report: PlanReport, *, node: str, frame: str) -> DiagnosticArray:
+    """Message of a report.
+
+    Args:
+        report: The report.
+        node: Name of the node; the status is called ``NODE: report``.
+        frame: ``header.frame_id``, the landing frame.
+    """
+    message = DiagnosticArray()
+    message.header.stamp = stamp_from_nanoseconds(report.stamp_ns)
+    message.header.frame_id = frame
+    message.status = [
+        DiagnosticStatus(
+            level=level_of(report.code),
+            name=f"{node}: report",
+            message=report.message,
+            hardware_id=report.problem,
+            values=key_values(_pairs(report)),
+        )
+    ]
+    return message
+
+
+def _pairs(report: PlanReport) -> Iterator[tuple[str, Value]]:
+    yield "code", report.code
+    yield "code_name", report.code_name
+    yield "source", report.source
+    yield "published", report.published
+    yield "drops", report.drops
+    yield "rejected", report.rejected
+    if report.input_stamp_ns is not None:
+        yield "input_stamp", stamp_text(report.input_stamp_ns)
+    yield "latency_ms", report.latency_ms
+    yield "mass_source", report.mass_source
+    for name, value in report.state.items():
+        yield _STATE + name, float(value)
+    if report.attempt is not None:
+        yield "iterations", report.attempt.iterations
+        for key in _NUMBERS:
+            yield key, getattr(report.attempt, key)
+        yield "warm_started", report.attempt.warm_started
+        yield "solver", report.attempt.solver
+    if report.certificate is not None:
+        yield from _certificate_pairs(report.certificate)
+    if report.rejection is not None:
+        yield "field", report.rejection.field
+        yield "value", report.rejection.value
+        yield "bound", report.rejection.bound
+
+
+def _certificate_pairs(certificate: CertificateFigures) -> Iterator[tuple[str, Value]]:
+    yield "certificate.passed", certificate.passed
+    for k, reason in enumerate(certificate.reasons):
+        yield f"{_REASON}{k}", reason
+    for key in _CERTIFICATE_NUMBERS:
+        yield f"certificate.{key}", getattr(certificate, key)
+    for k, check in enumerate(certificate.checks):
+        prefix = f"{_CHECK}{k}."
+        yield prefix + "name", check.name
+        for key in _CHECK_NUMBERS:
+            yield prefix + key, getattr(check, key)
+        yield prefix + "unit", check.unit
+        yield prefix + "passed", check.passed
+
+
+def report_from_message(message: DiagnosticArray) -> PlanReport:
+    """Report of a message.
+
+    Raises:
+        RejectedInputError: WRONG_ARRAY_LENGTH, INVALID_STAMP, REPORT_MISSING_KEY or
+            REPORT_BAD_VALUE.
+    """
+    require_length("status", len(message.status), 1)
+    status = message.status[0]
+    reader = KeyValueReader(status)
+    return PlanReport(
+        stamp_ns=nanoseconds_from_stamp(message.header.stamp),
+        source=reader.text("source"),
+        code=reader.integer("code"),
+        code_name=reader.text("code_name"),
+        message=status.message,
+        problem=status.hardware_id,
+        published=reader.boolean("published"),
+        drops=reader.integer("drops"),
+        rejected=reader.integer("rejected"),
+        input_stamp_ns=_input_stamp_ns(reader),
+        latency_ms=reader.optional_number("latency_ms"),
+        mass_source=reader.optional_text("mass_source"),
+        state=_state(reader),
+        attempt=_attempt(reader),
+        certificate=_certificate(reader),
+        rejection=_rejection(reader),
+    )
+
+
+def _input_stamp_ns(reader: KeyValueReader) -> int | None:
+    text = reader.optional_text("input_stamp")
+    if text is None:
+        return None
+    try:
+        return nanoseconds_from_stamp_text(text)
+    except ValueError:
+        raise RejectedInputError(
+            InputCode.REPORT_BAD_VALUE, "input_stamp", text, "SECONDS.NANOSECONDS"
+        ) from None
+
+
+def _state(reader: KeyValueReader) -> dict[str, float]:
+    state = {}
+    for key in reader.texts:
+        value = reader.optional_number(key) if key.startswith(_STATE) else None
+        if value is not None:
+            state[key.removeprefix(_STATE)] = value
+    return state
+
+
+def _attempt(reader: KeyValueReader) -> AttemptFigures | None:
+    if reader.optional_text("iterations") is None:
+        return None
+    return AttemptFigures(
+        iterations=reader.integer("iterations"),
+        warm_started=reader.boolean("warm_started"),
+        solver=reader.optional_text("solver"),
+        **{key: reader.optional_number(key) for key in _NUMBERS},
+    )
+
+
+def _certificate(reader: KeyValueReader) -> CertificateFigures | None:
+    if reader.optional_text("certificate.passed") is None:
+        return None
+    reasons: list[str] = []
+    while (reason := reader.optional_text(f"{_REASON}{len(reasons)}")) is not None:
+        reasons.append(reason)
+    return CertificateFigures(
+        passed=reader.boolean("certificate.passed"),
+        reasons=tuple(reasons),
+        checks=tuple(_checks(reader)),
+        **{key: reader.optional_number(f"certificate.{key}") for key in _CERTIFICATE_NUMBERS},
+    )
+
+
+def _checks(reader: KeyValueReader) -> Iterator[CheckFigures]:
+    for k in count():
+        prefix = f"{_CHECK}{k}."
+        if reader.optional_text(prefix + "name") is None:
+            return
+        yield CheckFigures(
+            name=reader.text(prefix + "name"),
+            unit=reader.text(prefix + "unit"),
+            passed=reader.boolean(prefix + "passed"),
+            **{key: reader.optional_number(prefix + key) for key in _CHECK_NUMBERS},
+        )
+
+
+def _rejection(reader: KeyValueReader) -> Rejection | None:
+    if reader.optional_text("field") is None:
+        return None
+    return Rejection(reader.text("field"), reader.text("value"), reader.text("bound"))

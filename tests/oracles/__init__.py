@@ -1,0 +1,1 @@
+"""Independent truths, sharing no code with the packages that they test."""
