@@ -19,7 +19,11 @@ class InvalidInputError(DscpError, ValueError):
     """
 
     def __init__(self, field: str, value: Any, bound: str) -> None:
-        super().__init__(f"{field}: {value!r} violates {bound}")
+        super().__init__(f"{field}: got {value!r}, expected {bound}")
         self.field = field
         self.value = value
         self.bound = bound
+
+    def __reduce__(self) -> tuple[type[InvalidInputError], tuple[str, Any, str]]:
+        """Rebuild from the three parts, not the message: it crosses process boundaries."""
+        return type(self), (self.field, self.value, self.bound)

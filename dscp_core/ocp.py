@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dscp_core.errors import InvalidInputError
-from dscp_core.parameters import Parameter, ParameterTable
+from dscp_core.parameters import Parameter, ParameterTable, Value
 
 TERMINAL_TIME = "terminal_time"
 VIRTUAL_CONTROL_WEIGHT = "virtual_control_weight"
@@ -68,14 +68,14 @@ Parameters = Mapping[str, ca.SX]
 
 
 @dataclass(frozen=True)
-class PathConstraint:
-    """A constraint ``g(x, u, p) <= 0``, linearised about the reference (eq. 7).
+class Constraint:
+    """What path and cone constraints have in common.
 
     Attributes:
         name: Name in reports.
-        expression: Scalar expression g, SI.
-        scale: SI magnitude by which the row is divided.
-        unit: Unit of g.
+        expression: Of a point and the parameters, SI; what it returns is the subclass's matter.
+        scale: SI magnitude by which the rows are divided.
+        unit: Unit of the expression.
         where: Node or interval mean.
         skip_first: Leave out the first node or interval (its state is pinned).
         skip_last: Leave out the last node or interval.
@@ -92,23 +92,12 @@ class PathConstraint:
     tolerance: float = 0.0
 
 
-@dataclass(frozen=True)
-class ConeConstraint:
-    """A second-order cone ``|g1(x, u, p)|_2 <= g0(x, u, p)``, both affine in (x, u).
+class PathConstraint(Constraint):
+    """``g(x, u, p) <= 0`` with the scalar g as the expression, linearised (eq. 7)."""
 
-    Attributes:
-        expression: Returns the column [g0; g1], SI.
-        Others as in `PathConstraint`.
-    """
 
-    name: str
-    expression: Callable[[StagePoint, Parameters], ca.SX]
-    scale: float
-    unit: str
-    where: Where = Where.NODE
-    skip_first: bool = False
-    skip_last: bool = False
-    tolerance: float = 0.0
+class ConeConstraint(Constraint):
+    """``|g1(x, u, p)|_2 <= g0(x, u, p)``, affine in (x, u); the expression is [g0; g1]."""
 
 
 @dataclass(frozen=True)
@@ -180,6 +169,8 @@ class OptimalControlProblem:
         virtual_control_scale: SI size of one unit of virtual control per state, 0 for a state
             without it; empty for a problem without any.
         virtual_control_weight: Default of the penalty, cost units per squared unit.
+        virtual_control_tolerance: Largest virtual control of a feasible trajectory, relative to the
+            states' scales; above what the penalty leaves where nothing is infeasible.
         trust_region_state: Default weights per state, scaled cost per scaled square.
         trust_region_control: Default weights per control, likewise.
         trust_region_step: Default weight on the interval length T, per (T_ref)^2 relative square.
@@ -187,6 +178,7 @@ class OptimalControlProblem:
         terminal_time_bounds: Least and greatest terminal time when it is free, or None.
         initial_state_parameters: Names of the parameters that hold the initial state; their
             values, one after the other, are the states in order.
+        check_parameters: Raises `InvalidInputError` for values by name that contradict each other.
         check_state: Raises `InvalidInputError` for an initial state that no plan can start from;
             arguments are the states (nx,) and the parameters' values by name.
         terminal_time_guess: First guess of a free terminal time in seconds, where the parameter's
@@ -214,10 +206,12 @@ class OptimalControlProblem:
     cone_constraints: tuple[ConeConstraint, ...] = ()
     virtual_control_scale: tuple[float, ...] = ()
     virtual_control_weight: float = 0.0
+    virtual_control_tolerance: float = 1e-6
     trust_region_state: tuple[float, ...] = ()
     trust_region_control: tuple[float, ...] = ()
     trust_region_step: float = 0.0
     initial_state_parameters: tuple[str, ...] = ()
+    check_parameters: Callable[[Mapping[str, Any]], None] | None = None
     check_state: Callable[[NDArray[np.float64], Mapping[str, Any]], None] | None = None
     terminal_time_guess: Callable[[NDArray[np.float64], Mapping[str, Any]], float] | None = None
     least_time_parameters: Mapping[str, float] = field(default_factory=dict)
@@ -241,6 +235,18 @@ class OptimalControlProblem:
         table = ParameterTable((*self.parameters, *self._scp_parameters()))
         table[TERMINAL_TIME]
         object.__setattr__(self, "table", table)
+
+    def pack(self, values: Mapping[str, Value] | None = None) -> NDArray[np.float64]:
+        """Packed parameters, SI: the defaults overridden by ``values``.
+
+        Raises:
+            InvalidInputError: An unknown name, an invalid value, or values that contradict each
+                other.
+        """
+        packed = self.table.pack(values)
+        if self.check_parameters is not None:
+            self.check_parameters(self.table.unpack(packed))
+        return packed
 
     def _scp_parameters(self) -> Sequence[Parameter]:
         """Parameters of the algorithm (theta_SCP), appended to those of the problem."""

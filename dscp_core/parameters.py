@@ -56,9 +56,12 @@ class Parameter:
             InvalidInputError: Not numeric, of the wrong length, not finite, or out of bounds.
         """
         try:
-            array = np.atleast_1d(np.asarray(value, dtype=np.float64)).copy()
-        except (TypeError, ValueError):
+            given = np.atleast_1d(np.asarray(value))
+        except ValueError:  # a ragged list
             raise InvalidInputError(self.name, value, "a number or a list of numbers") from None
+        if given.dtype.kind not in "iuf":
+            raise InvalidInputError(self.name, value, "a number or a list of numbers")
+        array = given.astype(np.float64)
         if array.shape != (self.size,):
             raise InvalidInputError(self.name, value, f"length {self.size}")
         if not np.all(np.isfinite(array)):

@@ -32,6 +32,7 @@ _STATUS = {
     ScpStatus.ITERATION_LIMIT: PlanStatus.ITERATION_LIMIT,
     ScpStatus.DEADLINE: PlanStatus.DEADLINE,
     ScpStatus.SOLVER_FAILURE: PlanStatus.SOLVER_FAILURE,
+    ScpStatus.DIVERGED: PlanStatus.SOLVER_FAILURE,
 }
 
 
@@ -110,7 +111,7 @@ class Planner:
             settings.intervals,
             free_terminal_time=settings.terminal_time is TerminalTime.FREE,
         )
-        self.parameters = self.problem.table.pack(settings.parameters)
+        self.parameters = self.problem.pack(settings.parameters)
         self.scp = Scp(self.transcription, settings.options)
         self._verifier = PlanVerifier(self.problem, settings.intervals, hold=settings.hold)
         self._time = self.problem.table.slice(TERMINAL_TIME)

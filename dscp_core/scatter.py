@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from dscp_core.cone_program import ConePattern, CscPattern
 from dscp_core.layout import TrajectoryLayout
-from dscp_core.ocp import ConeConstraint, OptimalControlProblem, PathConstraint, Where
+from dscp_core.ocp import ConeConstraint, Constraint, OptimalControlProblem, Where
 from dscp_core.stages import Block, Kind, Stage, StageFunctions
 
 Indices = NDArray[np.int64]
@@ -73,7 +73,7 @@ class ValueScatter:
         if terminal:
             groups.append(RowGroup("terminal_time", 0, 1, np.zeros(2, int)))
             start = 2
-        every: list[PathConstraint | ConeConstraint] = [
+        every: list[Constraint] = [
             *self._problem.path_constraints,
             *self._problem.cone_constraints,
         ]

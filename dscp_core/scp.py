@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, field, replace
-from enum import Enum
 from typing import Any
 
 import numpy as np
@@ -14,7 +13,10 @@ from dscp_core.cone_program import ConePattern, ConeSolution, ConeValues, SolveS
 from dscp_core.errors import InvalidInputError
 from dscp_core.sensitivity import KktSystem
 from dscp_core.solvers import SolverSettings, make_solver
+from dscp_core.trace import Iteration, ScpResult, ScpStatus
 from dscp_core.transcription import Evaluation, Transcription
+
+__all__ = ["Iteration", "Scp", "ScpOptions", "ScpResult", "ScpStatus", "objective"]
 
 Array = NDArray[np.float64]
 
@@ -25,18 +27,7 @@ GRADIENT_TOLERANCE = 1e-12
 
 _SETTLED_ITERATIONS = 3
 _SETTLED_CHANGE = 1e-3
-
-
-class ScpStatus(Enum):
-    """Why the iterations stopped."""
-
-    CONVERGED = "converged"
-    FIXED_ITERATIONS = "fixed number of iterations done"
-    INFEASIBLE = "converged with virtual control left: no feasible trajectory"
-    ITERATION_LIMIT = "iteration limit"
-    DEADLINE = "deadline"
-    SUBPROBLEM_INFEASIBLE = "subproblem infeasible"
-    SOLVER_FAILURE = "solver failure"
+_SETTLED_DEFECT = 0.05  # of the virtual control
 
 
 @dataclass(frozen=True)
@@ -49,7 +40,8 @@ class ScpOptions:
         cost_tolerance: Bound on the relative change of the penalised cost (eq. for epsilon_J) and
             on the change that the subproblem predicted.
         defect_tolerance: Bound on the defects, relative to the states' scales.
-        virtual_control_tolerance: Bound on the virtual control, relative to the states' scales.
+        virtual_control_tolerance: Bound on the virtual control, relative to the states' scales, or
+            None for the problem's own.
         polish: Refine each subproblem's solution on its active set, for differentiation.
         deadline_s: Wall time for all iterations, or None.
         solver: Backend, or backends to try in order, separated by commas.
@@ -60,7 +52,7 @@ class ScpOptions:
     fixed_iterations: int | None = None
     cost_tolerance: float = 1e-8
     defect_tolerance: float = 1e-6
-    virtual_control_tolerance: float = 1e-6
+    virtual_control_tolerance: float | None = None
     polish: bool = False
     deadline_s: float | None = None
     solver: str = DEFAULT_SOLVER
@@ -68,8 +60,9 @@ class ScpOptions:
 
     def __post_init__(self) -> None:
         for name in ("cost_tolerance", "defect_tolerance", "virtual_control_tolerance"):
-            if not getattr(self, name) > 0.0:
-                raise InvalidInputError(name, getattr(self, name), "> 0")
+            value = getattr(self, name)
+            if value is not None and not value > 0.0:
+                raise InvalidInputError(name, value, "> 0")
         if self.max_iterations < 1:
             raise InvalidInputError("max_iterations", self.max_iterations, ">= 1")
         if self.fixed_iterations is not None and self.fixed_iterations < 1:
@@ -89,75 +82,6 @@ class ScpOptions:
         return self.fixed_iterations or self.max_iterations
 
 
-@dataclass(frozen=True)
-class Iteration:
-    """One iteration k of the trace.
-
-    Attributes:
-        reference: Scaled reference vector that the subproblem was built about.
-        values: The subproblem's values.
-        solution: Its solution, polished when `ScpOptions.polish` is set.
-        cost: True cost J of the solution's trajectory, in its own units.
-        penalised_cost: J plus the virtual-control penalty, scaled.
-        predicted_change: Change of the subproblem's objective from reference to solution, scaled.
-        defects: (N, nx) residual of the discrete dynamics at the solution, SI.
-        virtual_control: (N, nx), SI.
-        assembly_seconds: Time spent on values and evaluation.
-        solve_seconds: The solver's own time, set-up included.
-        polish_seconds: Time of the refinement.
-    """
-
-    reference: Array
-    values: ConeValues
-    solution: ConeSolution
-    cost: float
-    penalised_cost: float
-    predicted_change: float
-    defects: Array
-    virtual_control: Array
-    assembly_seconds: float
-    solve_seconds: float
-    polish_seconds: float
-
-
-@dataclass(frozen=True)
-class ScpResult:
-    """Full trace of a run.
-
-    Attributes:
-        status: Why it stopped.
-        message: In words, with the numbers.
-        iterations: Completed iterations, in order.
-        parameters: Packed parameters of the run, SI.
-        initial_reference: Scaled reference vector of the first iteration.
-        warm_started: Whether the caller gave that reference.
-        seconds: Wall time of the run.
-        failed: Answer of the solver in the iteration that failed, or None.
-    """
-
-    status: ScpStatus
-    message: str
-    iterations: tuple[Iteration, ...]
-    parameters: Array
-    initial_reference: Array
-    warm_started: bool
-    seconds: float
-    failed: ConeSolution | None = None
-
-    @property
-    def final_reference(self) -> Array:
-        """Reference vector after the last iteration."""
-        if not self.iterations:
-            return self.initial_reference
-        size = self.initial_reference.size
-        return self.iterations[-1].solution.z[:size]
-
-    @property
-    def succeeded(self) -> bool:
-        """Whether the trace ended as asked."""
-        return self.status in (ScpStatus.CONVERGED, ScpStatus.FIXED_ITERATIONS)
-
-
 class Scp:
     """The SCP loop of one transcription; keeps solver and symbolic work between runs.
 
@@ -171,6 +95,12 @@ class Scp:
         self._solver = make_solver(
             self.options.solver, transcription.pattern, self.options.solver_settings
         )
+
+    @property
+    def virtual_control_tolerance(self) -> float:
+        """Bound on the virtual control: of the options, or else of the problem."""
+        given = self.options.virtual_control_tolerance
+        return self.transcription.problem.virtual_control_tolerance if given is None else given
 
     def with_options(self, **changes: Any) -> Scp:
         """A loop with changed options that shares this one's symbolic work."""
@@ -210,6 +140,7 @@ class _Run:
         self._start = time.perf_counter()
         self._scp = scp
         self._options = scp.options
+        self._virtual_tolerance = scp.virtual_control_tolerance
         self._transcription = scp.transcription
         self._parameters = np.array(parameters, dtype=np.float64)
         self._warm = initial_reference is not None
@@ -234,9 +165,12 @@ class _Run:
             remaining = self._remaining()
             if remaining is not None and remaining <= 0.0:
                 return self._finish(ScpStatus.DEADLINE, "no time for another iteration")
-            iteration, evaluation = self._iterate(reference, evaluation, remaining)
+            try:
+                iteration, evaluation = self._iterate(reference, evaluation, remaining)
+            except InvalidInputError as error:  # the solvers refuse data that are not finite
+                return self._finish(ScpStatus.DIVERGED, f"{self._progress()}; {error}")
             if isinstance(iteration, ConeSolution):
-                return self._failure(iteration)
+                return self._failure(iteration, reference)
             self._iterations.append(iteration)
             reference = iteration.solution.z[: reference.size]
             if self._options.fixed_iterations is None:
@@ -315,9 +249,8 @@ class _Run:
         sizes = [self._relative(i.virtual_control) for i in self._iterations[-_SETTLED_ITERATIONS:]]
         return (
             len(sizes) == _SETTLED_ITERATIONS
-            and self._relative(last.defects - last.virtual_control)
-            <= self._options.defect_tolerance
-            and min(sizes) > self._options.virtual_control_tolerance
+            and self._relative(last.defects - last.virtual_control) <= _SETTLED_DEFECT * min(sizes)
+            and min(sizes) > self._virtual_tolerance
             and max(sizes) - min(sizes) <= _SETTLED_CHANGE * max(sizes)
         )
 
@@ -327,11 +260,13 @@ class _Run:
     def _converged(self) -> ScpResult:
         last = self._iterations[-1]
         virtual = self._relative(last.virtual_control)
-        if virtual > self._options.virtual_control_tolerance:
+        if virtual > self._virtual_tolerance:
             return self._finish(ScpStatus.INFEASIBLE, self._progress())
         return self._finish(ScpStatus.CONVERGED, self._progress())
 
     def _progress(self) -> str:
+        if not self._iterations:
+            return "no iteration done"
         last = self._iterations[-1]
         return (
             f"{len(self._iterations)} iterations, predicted change {last.predicted_change:.1e}, "
@@ -339,16 +274,38 @@ class _Run:
             f"virtual control {self._relative(last.virtual_control):.1e} (scaled)"
         )
 
-    def _failure(self, solution: ConeSolution) -> ScpResult:
+    def _failure(self, solution: ConeSolution, reference: Array) -> ScpResult:
         number = len(self._iterations) + 1
         message = f"iteration {number}: {solution.solver}: {solution.status.value}"
         if solution.message:
             message += f" ({solution.message})"
-        status = {
-            SolveStatus.TIME_LIMIT: ScpStatus.DEADLINE,
-            SolveStatus.INFEASIBLE: ScpStatus.SUBPROBLEM_INFEASIBLE,
-        }.get(solution.status, ScpStatus.SOLVER_FAILURE)
-        return self._finish(status, message, solution)
+        if solution.status is SolveStatus.TIME_LIMIT:
+            return self._finish(ScpStatus.DEADLINE, message, solution)
+        if solution.status is SolveStatus.INFEASIBLE:
+            return self._finish(ScpStatus.SUBPROBLEM_INFEASIBLE, message, solution)
+        status, reason = self._diagnose(reference)
+        return self._finish(status, f"{message}; {reason}", solution)
+
+    def _diagnose(self, reference: Array) -> tuple[ScpStatus, str]:
+        """Tell an infeasible subproblem from a failing solver, by its least virtual control.
+
+        Where even that is large, the penalty's multipliers are what the solver failed on.
+        """
+        layout, pattern = self._transcription.layout, self._transcription.pattern
+        values = self._transcription.values(reference, self._parameters).copy()
+        virtual = int(pattern.q.indptr[layout.reference_size])
+        values.q[:virtual] = 0.0
+        values.q[virtual:] = 1.0
+        values.c[:] = 0.0
+        least = self._scp.solve(values, self._remaining())
+        if least.status is SolveStatus.INFEASIBLE:
+            return ScpStatus.SUBPROBLEM_INFEASIBLE, "infeasible even with free virtual control"
+        if least.status is SolveStatus.SOLVED:
+            size = self._relative(layout.virtual_control(least.z))
+            if size > self._virtual_tolerance:
+                found = f"the subproblem needs a virtual control of {size:.1e} (scaled)"
+                return ScpStatus.INFEASIBLE, found
+        return ScpStatus.SOLVER_FAILURE, "not infeasible as far as can be told"
 
     def _finish(
         self, status: ScpStatus, message: str, failed: ConeSolution | None = None

@@ -23,7 +23,7 @@ from dscp_core.ocp import (
     TRUST_REGION_STATE,
     TRUST_REGION_STEP,
     VIRTUAL_CONTROL_WEIGHT,
-    ConeConstraint,
+    Constraint,
     CostTerm,
     OptimalControlProblem,
     PathConstraint,
@@ -333,11 +333,9 @@ def _add_quadratic(collect: _Collector, name: str, cost: ca.SX, symbols: _Symbol
     collect.vector(Kind.COST_VECTOR, "", linear)
 
 
-def constraints(
-    problem: OptimalControlProblem, where: Where
-) -> Iterable[PathConstraint | ConeConstraint]:
+def constraints(problem: OptimalControlProblem, where: Where) -> Iterable[Constraint]:
     """Constraints at nodes or at interval means, linear ones first."""
-    every: tuple[PathConstraint | ConeConstraint, ...] = (
+    every: tuple[Constraint, ...] = (
         *problem.path_constraints,
         *problem.cone_constraints,
     )

@@ -7,6 +7,7 @@ what is certified, and by the constraints between the nodes.
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from enum import Enum
 
@@ -18,7 +19,7 @@ from numpy.typing import NDArray
 from dscp_core.compiled import CompiledFunction
 from dscp_core.errors import InvalidInputError
 from dscp_core.ocp import (
-    ConeConstraint,
+    Constraint,
     OptimalControlProblem,
     PathConstraint,
     StagePoint,
@@ -176,7 +177,11 @@ class PlanVerifier:
             controls: (N+1, nu) planned controls, SI.
             parameters: Packed parameters, SI.
         """
-        (times, flown, applied), failure = self._fly(times_s, states[0], controls, parameters)
+        with warnings.catch_warnings():
+            # What it warns of is a reason of the certificate.
+            warnings.simplefilter("ignore", scipy.integrate.ODEintWarning)
+            flight, failure = self._fly(times_s, states[0], controls, parameters)
+        times, flown, applied = flight
         checks: list[Check] = []
         if failure is None:
             missed = self._misses(flown[-1], parameters)[0]
@@ -262,9 +267,7 @@ def _stacked(
     return times, states, np.vstack(applied)[: times.size]
 
 
-def _violation(
-    constraint: PathConstraint | ConeConstraint, point: StagePoint, parameters: dict[str, ca.SX]
-) -> ca.SX:
+def _violation(constraint: Constraint, point: StagePoint, parameters: dict[str, ca.SX]) -> ca.SX:
     value = constraint.expression(point, parameters)
     if isinstance(constraint, PathConstraint):
         return value

@@ -34,9 +34,10 @@ class Difference:
             runs that can be trusted.
         uncertainty: Disagreement of the best two extrapolations, at least the rounding.
         step: The largest step behind the value.
-        kind: ``"central"``; ``"forward"`` or ``"backward"`` for a parameter at its bound.
-        active_set_radius: Change of the parameter, to first order, at which the first active set
-            changes.
+        kind: ``"central"``; ``"forward"`` or ``"backward"`` next to a bound of the parameter or
+            to a change of an active set.
+        active_set_radius: Change of the parameter in the directions of the runs, to first order,
+            at which the first active set changes.
         rejected: Steps that were not used, because a run failed or could not be polished.
     """
 
@@ -111,20 +112,25 @@ class RunDifferences:
         radii = {sign: self._radius(sign * direction) for sign in (1.0, -1.0)}
         size = float(np.max(np.abs(theta[position])))
         here = float(theta[position.start + component])
+        usable: list[tuple[str, float, float]] = []
         for kind, (offsets, _) in _STENCILS.items():
             radius = min(radii[float(np.sign(offset))] for offset in offsets if offset)
             first = _first_step(size, radius / _REACH[kind], step)
             ends = [here + first * offset for offset in offsets]
             if declared.lower <= min(ends) and max(ends) <= declared.upper:
-                return self._shrink(direction, first, kind, radius)
-        raise InvalidInputError(
-            "step", step, f"within [{declared.lower:g}, {declared.upper:g}] of {name} at {here:g}"
-        )
+                usable.append((kind, first, radius))
+        if not usable:
+            bounds = f"[{declared.lower:g}, {declared.upper:g}]"
+            raise InvalidInputError("step", step, f"within {bounds} of {name} at {here:g}")
+        # Central, unless a kink is so close that one side reaches further; steps shrink anyway.
+        inside = [(k, h, radius) for k, h, radius in usable if h * _REACH[k] <= radius]
+        widest = max(usable, key=lambda choice: choice[2] / (choice[1] * _REACH[choice[0]]))
+        return self._shrink(direction, *(inside[0] if inside else widest))
 
     def _radius(self, direction: Array) -> float:
         return tangent(self._scp, self._trace, direction).active_set_radius
 
-    def _shrink(self, direction: Array, first: float, kind: str, radius: float) -> Difference:
+    def _shrink(self, direction: Array, kind: str, first: float, radius: float) -> Difference:
         slopes: list[tuple[float, float]] = []
         older: _Extrapolation | None = None
         best, doubt, rejected = None, np.inf, 0

@@ -61,13 +61,15 @@ class Sweep:
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0.0):
                 raise InvalidInputError(name, value, "finite and > 0 s")
-        if self.stop_s < self.start_s:
-            raise InvalidInputError("stop_s", self.stop_s, f">= start_s, {self.start_s:g} s")
-        if (self.stop_s - self.start_s) / self.step_s >= _MOST_POINTS:
-            raise InvalidInputError("step_s", self.step_s, f"at most {_MOST_POINTS} points")
         declared = problems.get(self.settings.problem, self.settings.formulation).table
         for value in (self.start_s, self.stop_s):
             declared[TERMINAL_TIME].validate(value)
+        if self.stop_s < self.start_s:
+            raise InvalidInputError("stop_s", self.stop_s, f">= start_s, {self.start_s:g} s")
+        if (self.stop_s - self.start_s) / self.step_s >= _MOST_POINTS:
+            raise InvalidInputError(
+                "step_s", self.step_s, f"a step with at most {_MOST_POINTS} points"
+            )
 
     @property
     def times_s(self) -> tuple[float, ...]:
@@ -90,6 +92,7 @@ class SweepPoint:
         trusted: Whether the gradient's verdict trusts it.
         central_difference_kg_s: The same by differences of the whole SCP at the same K.
         uncertainty_kg_s: Of the difference.
+        across_kink: Whether an active set changes within its step: it is no reference then.
         relative_error: Of the gradient against the difference; NaN where the difference does not
             tell the gradient from zero.
         reasons: Why the gradient is not trusted, or why there is none.
@@ -104,6 +107,7 @@ class SweepPoint:
     trusted: bool
     central_difference_kg_s: float
     uncertainty_kg_s: float
+    across_kink: bool
     relative_error: float
     reasons: tuple[str, ...]
 
@@ -115,7 +119,7 @@ class SweepPoint:
     @property
     def compared(self) -> bool:
         """Whether the difference says something about the gradient."""
-        return math.isfinite(self.relative_error)
+        return math.isfinite(self.relative_error) and not self.across_kink
 
 
 @dataclass(frozen=True)
@@ -134,6 +138,7 @@ class SweepSummary:
         mean_iterations: Over the feasible points from `RELIABLE_FROM_S` on.
         regular_share: Share of them whose gradient is trusted.
         compared: Number of trusted points with a usable difference, of the same.
+        across_kink: Number of trusted points whose difference is not, as it crosses a kink.
         median_relative_error: Over the compared points.
         max_relative_error: Over the compared points.
         max_relative_error_at_s: Where that is.
@@ -151,6 +156,7 @@ class SweepSummary:
     mean_iterations: float | None
     regular_share: float | None
     compared: int
+    across_kink: int
     median_relative_error: float | None
     max_relative_error: float | None
     max_relative_error_at_s: float | None
@@ -227,6 +233,7 @@ def summarise(sweep: Sweep, points: Sequence[SweepPoint]) -> SweepSummary:
         mean_iterations=fmean(p.iterations for p in reliable) if reliable else None,
         regular_share=fmean(p.trusted for p in reliable) if reliable else None,
         compared=len(compared),
+        across_kink=sum(p.trusted and p.across_kink for p in reliable),
         median_relative_error=median(p.relative_error for p in compared) if compared else None,
         max_relative_error=None if worst is None else worst.relative_error,
         max_relative_error_at_s=None if worst is None else worst.terminal_time_s,
@@ -253,6 +260,7 @@ def _point(planner: Planner, time_s: float) -> SweepPoint:
         trusted=False,
         central_difference_kg_s=math.nan,
         uncertainty_kg_s=math.nan,
+        across_kink=False,
         relative_error=math.nan,
         reasons=(trace.message,),
     )
@@ -274,6 +282,7 @@ def _point(planner: Planner, time_s: float) -> SweepPoint:
         trusted=gradient.trusted and converged,
         central_difference_kg_s=value,
         uncertainty_kg_s=difference.uncertainty,
+        across_kink=difference.crosses_active_set_change,
         relative_error=math.nan if error is None else error,
         reasons=gradient.reasons if converged else (*gradient.reasons, trace.message),
     )

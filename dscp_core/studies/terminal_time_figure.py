@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -79,10 +80,11 @@ def _draw_mass(axes: Axes, points: Sequence[SweepPoint], summary: SweepSummary) 
     axes.set_title("final mass [kg]", loc="left", fontsize=11)
     axes.ticklabel_format(axis="y", useOffset=False)
     axes.legend(loc="lower center", fontsize=9)
-    if summary.least_feasible_s is not None:
+    least = summary.least_feasible_s
+    if least is not None and points[0].terminal_time_s <= least <= points[-1].terminal_time_s:
         axes.annotate(
-            f"feasible from {summary.least_feasible_s:.4f} s",
-            (summary.least_feasible_s, 0.03),
+            f"feasible from {least:.4f} s",
+            (least, 0.03),
             xycoords=("data", "axes fraction"),
             xytext=(4, 0),
             textcoords="offset points",
@@ -125,24 +127,29 @@ def _draw_gradient(axes: Axes, points: Sequence[SweepPoint], summary: SweepSumma
 
 
 def _draw_error(axes: Axes, points: Sequence[SweepPoint]) -> None:
-    for trusted, colour, marker, label in (
-        (True, FLOWN, ".", "regular"),
-        (False, _FLAGGED, "x", "flagged by the verdict"),
+    regular = [p for p in points if p.trusted and p.compared]
+    flagged = [p for p in points if p.feasible and not p.trusted and p.compared]
+    kinks = [p for p in points if p.feasible and p.across_kink]
+    for chosen, colour, marker, label in (
+        (regular, FLOWN, ".", "regular"),
+        (flagged, _FLAGGED, "x", "flagged by the verdict"),
+        (kinks, LIMIT, "+", "difference across a kink"),
     ):
-        chosen = [p for p in points if p.feasible and p.trusted is trusted and p.compared]
-        if chosen:
-            axes.semilogy(
-                [p.terminal_time_s for p in chosen],
-                [max(p.relative_error, _LEAST_ERROR_SHOWN) for p in chosen],
+        known = [p for p in chosen if math.isfinite(p.relative_error)]
+        if known:
+            axes.plot(
+                [p.terminal_time_s for p in known],
+                [max(p.relative_error, _LEAST_ERROR_SHOWN) for p in known],
                 marker,
                 color=colour,
                 markersize=5,
                 label=label,
             )
     axes.set_yscale("log")
-    axes.set_ylim(top=max(axes.get_ylim()[1], 1e-4))  # room for the legend
+    axes.set_ylim(top=max(axes.get_ylim()[1], 1e-5))  # room for the legend
     axes.axhline(1e-6, color=LIMIT, linestyle="--", linewidth=1.0)
     axes.set_title(
         "relative error of the gradient against central differences", loc="left", fontsize=11
     )
-    axes.legend(loc="upper right", fontsize=9)
+    if axes.get_legend_handles_labels()[0]:
+        axes.legend(loc="upper right", fontsize=9, ncols=3)

@@ -94,7 +94,7 @@ def parse_assignments(assignments: Sequence[str]) -> dict[str, Value]:
         if not (name and equals and text):
             raise InvalidInputError("--set", assignment, "NAME=VALUE")
         if name in values:
-            raise InvalidInputError("--set", assignment, f"{name} set once")
+            raise InvalidInputError("--set", assignment, f"{name} only once")
         try:
             numbers = [float(part) for part in text.split(",")]
         except ValueError:

@@ -18,7 +18,7 @@ examples:
   dscp bag info BAG
   dscp bag check BAG && echo good
   dscp bag recover DAMAGED_BAG GOOD_BAG
-  dscp bag record BAG /dscp_planner/trajectory /dscp_planner/report
+  dscp bag record BAG /planner/trajectory /planner/report
 """
 
 _COMPRESSIONS = ("zstd", "lz4", "none")

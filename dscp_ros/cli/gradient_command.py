@@ -143,7 +143,7 @@ def _require(args: argparse.Namespace) -> None:
     if args.step is not None and not (math.isfinite(args.step) and args.step > 0.0):
         raise InvalidInputError("--step", args.step, "finite and > 0")
     if args.step is not None and not args.check:
-        raise InvalidInputError("--step", args.step, "given with --check only")
+        raise InvalidInputError("--step", args.step, "--check beside it")
 
 
 def _print(report: GradientReport) -> None:

@@ -226,7 +226,7 @@ def _infeasible(scp: Scp, trace: ScpResult, method: str) -> bool:
         return False
     scale = scp.transcription.layout.state_scale
     left = float(np.max(np.abs(trace.iterations[-1].virtual_control) / scale))
-    return left > scp.options.virtual_control_tolerance
+    return left > scp.virtual_control_tolerance
 
 
 def _described(difference: Difference) -> dict[str, Any]:

@@ -36,7 +36,7 @@ Ctrl-C or SIGTERM stops it with exit code 0.
 EPILOG = """\
 examples:
   dscp replay BAG
-  dscp replay BAG --topics /state /mass --remap /state:=/dscp_planner/state
+  dscp replay BAG --topics /state /mass --remap /state:=/planner/state
   dscp replay BAG --restamp --wait-for-subscribers 1
   dscp replay BAG --start-offset 10 --duration 5 --rate 0.5 --loop
   dscp replay BAG --clock 100        (the consumers need use_sim_time)

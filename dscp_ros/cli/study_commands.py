@@ -103,7 +103,7 @@ def run_terminal_time(args: argparse.Namespace) -> int:
         InvalidInputError: A value that cannot be used.
     """
     if args.quick and args.step is not None:
-        raise InvalidInputError("--step", args.step, "not given together with --quick")
+        raise InvalidInputError("--step", args.step, "no --step beside --quick")
     if args.output.exists() and not args.output.is_dir():
         raise InvalidInputError("--output", str(args.output), "a directory")
     from tqdm import tqdm
@@ -141,13 +141,14 @@ _NUMBERS = (
     "uncertainty_kg_s",
     "relative_error",
 )
-_COLUMNS = (*_NUMBERS, "status", "trusted", "reasons")
+_COLUMNS = (*_NUMBERS, "status", "trusted", "across_kink", "reasons")
 
 
 def _row(point: SweepPoint) -> tuple[object, ...]:
     numbers = (getattr(point, name) for name in _NUMBERS)
     cells = (number if math.isfinite(number) else "" for number in numbers)
-    return (*cells, point.status.name.lower(), point.trusted, "; ".join(point.reasons))
+    verdict = (point.status.name.lower(), point.trusted, point.across_kink)
+    return (*cells, *verdict, "; ".join(point.reasons))
 
 
 def _print(summary: SweepSummary, files: dict[str, str]) -> None:
@@ -179,7 +180,8 @@ def _print(summary: SweepSummary, files: dict[str, str]) -> None:
         [
             ("mean iterations", _text(summary.mean_iterations, ".2f")),
             ("regular points", _text(share, ".1f", "%")),
-            ("compared", str(summary.compared)),
+            ("of these compared", str(summary.compared)),
+            ("not, next to a kink", str(summary.across_kink)),
             ("median relative error", _text(summary.median_relative_error, ".1e")),
             ("greatest relative error", worst),
             (f"unflagged above {GROSS_ERROR:g}", str(summary.unflagged_gross_errors)),

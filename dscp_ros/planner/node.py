@@ -224,7 +224,7 @@ class PlannerNode:
         try:
             change = self._parameters.reread_files()
             planner = change.settings.planner
-            rebuilt = self._worker.call(lambda: self._session.rebuild(planner))
+            rebuilt = self._worker.call(lambda: self._rebuild(planner))
             await self._finished(rebuilt)
             rebuilt.result()
             self._requested = planner
@@ -255,8 +255,13 @@ class PlannerNode:
         if settings.planner == self._requested:
             return
         self._requested = settings.planner
-        rebuilt = self._worker.call(lambda: self._session.rebuild(settings.planner))
+        rebuilt = self._worker.call(lambda: self._rebuild(settings.planner))
         rebuilt.add_done_callback(self._note_rebuild)
+
+    def _rebuild(self, settings: PlannerSettings) -> None:
+        self._session.rebuild(settings)
+        # A plan with fewer intervals would leave thrust arrows of the old one standing.
+        self._outputs.clear_drawing(self._now_ns())
 
     def _note_rebuild(self, rebuilt: Future[Any]) -> None:
         if rebuilt.cancelled():
@@ -274,7 +279,8 @@ class PlannerNode:
         """Begin anew when the clock was set back, by a simulation's reset or a bag's loop."""
         self._forget()
         jump_s = jump.delta.nanoseconds / 1e9
-        message = f"the clock jumped by {jump_s:.3f} s: warm start, stamps and mass forgotten"
+        cause = f"jumped by {jump_s:.3f} s" if jump_s else "changed its source"
+        message = f"the clock {cause}: warm start, stamps and mass forgotten"
         self._node.get_logger().warning(message)
         self._outputs.publish_report(self._event(NodeCode.CLOCK_JUMPED_BACK, message, "clock"))
 

@@ -175,7 +175,7 @@ def node_settings(
     """
     _check_solver(values["solver"])
     vehicle = _vehicle_values(problem, values)
-    problem.table.pack(vehicle)
+    problem.pack(vehicle)
     return NodeSettings(
         planner=PlannerSettings(
             problem=problem.name,
@@ -188,7 +188,7 @@ def node_settings(
                 max_iterations=values["max_iterations"],
                 cost_tolerance=values["cost_tolerance"],
                 defect_tolerance=values["defect_tolerance"],
-                virtual_control_tolerance=values["virtual_control_tolerance"],
+                virtual_control_tolerance=values["virtual_control_tolerance"] or None,
                 solver=values["solver"],
             ),
         ),
@@ -330,10 +330,11 @@ _PLANNING = (
     ),
     NodeParameter(
         "virtual_control_tolerance",
-        _OPTIONS.virtual_control_tolerance,
-        "Feasible when the virtual control is less, relative to the states' scales.",
+        0.0,
+        "Feasible when the virtual control is less, relative to the states' scales; 0 for the "
+        "problem's own.",
         "1",
-        1e-15,
+        0.0,
         1.0,
     ),
     NodeParameter(

@@ -134,7 +134,7 @@ def test_bad_input_names_field_value_and_bound(
     assert frame.main(["probe"]) == ExitCode.BAD_INPUT
     output = capsys.readouterr()
     assert output.out == ""
-    assert output.err == "dscp: error: mass: -1.5 violates > 0 kg\n"
+    assert output.err == "dscp: error: mass: got -1.5, expected > 0 kg\n"
 
     assert frame.main(["probe", "--json"]) == ExitCode.BAD_INPUT
     error = json.loads(capsys.readouterr().out)["error"]

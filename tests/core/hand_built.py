@@ -91,7 +91,9 @@ class Subproblem:
             q, c, a, b, np.array([r for r, _ in rows]), np.array([v for _, v in rows])
         )
 
-    def _dynamics(self, size: int, relaxed: Array, virtual_scale: Array) -> tuple[Array, Array]:
+    def _dynamics(
+        self, size: int, relaxed: NDArray[np.int_], virtual_scale: Array
+    ) -> tuple[Array, Array]:
         count, step = self.intervals, self.step_s
         a, b = np.zeros((7 * count + 13, size)), np.zeros(7 * count + 13)
         for n in range(count):

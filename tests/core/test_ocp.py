@@ -83,7 +83,7 @@ def test_problems_by_name() -> None:
     assert problems.formulations("powered_descent") == ("convergent", "printed")
     default, named = problems.get("powered_descent"), problems.get("powered_descent", "convergent")
     assert [c.name for c in default.cone_constraints] == [c.name for c in named.cone_constraints]
-    with pytest.raises(InvalidInputError, match="problem: 'entry'"):
+    with pytest.raises(InvalidInputError, match="problem: got 'entry'"):
         problems.get("entry")
     with pytest.raises(InvalidInputError, match="one of convergent, printed"):
         problems.get("powered_descent", "fast")

@@ -76,6 +76,15 @@ def test_infeasible_terminal_time(scp: Scp, terminal_time: float) -> None:
     assert np.max(np.abs(last.virtual_control) / scale) > 1e-5
 
 
+def test_stationary_is_not_feasible(scp: Scp) -> None:
+    # From its own end, an infeasible run is stationary at once, and as infeasible as before.
+    parameters = packed(scp, terminal_time=31.0)
+    end = scp.run(parameters).final_reference
+    result = scp.with_options(cost_tolerance=1e-4).run(parameters, end)
+    assert result.status is ScpStatus.INFEASIBLE
+    assert len(result.iterations) == 1
+
+
 def test_shortest_times_are_feasible(scp: Scp) -> None:
     for terminal_time in (32.06, 32.1):
         result = scp.run(packed(scp, terminal_time=terminal_time))
@@ -212,8 +221,8 @@ def test_trace_is_consistent(scp: Scp, nominal: ScpResult) -> None:
         start = np.concatenate([reference, layout.virtual_part(defects)])
         predicted = cost_of(z) - cost_of(start)
         # Rounding of the quadratic terms, 1e3 scaled and more with virtual control.
-        rounding = 1e-12 * (abs(cost_of(z)) + abs(cost_of(start)) + np.abs(full @ z) @ np.abs(z))
-        assert iteration.predicted_change == pytest.approx(predicted, abs=rounding)
+        size = abs(cost_of(z)) + abs(cost_of(start)) + float(np.abs(full @ z) @ np.abs(z))
+        assert iteration.predicted_change == pytest.approx(predicted, abs=1e-12 * size)
         assert iteration.assembly_seconds > 0.0
         assert iteration.solve_seconds > 0.0
         assert iteration.polish_seconds >= 0.0

@@ -142,7 +142,9 @@ def test_trajectory_is_in_si(descent: Scp) -> None:
     position = torch.tensor([[5000.0, 500.0, 500.0]], dtype=torch.float64)
     batch = layer(initial_position=position, terminal_time=torch.tensor([33.3]))
     layout = descent.transcription.layout
-    trace = descent.run(descent.transcription.table.pack({"terminal_time": np.float32(33.3)}))
+    trace = descent.run(
+        descent.transcription.table.pack({"terminal_time": float(np.float32(33.3))})
+    )
     assert batch.states.shape == (1, 16, 7)
     assert batch.controls.shape == (1, 16, 3)
     np.testing.assert_allclose(batch.states[0].numpy(), layout.states(trace.final_reference))
@@ -280,7 +282,7 @@ def test_bad_fixed_parameter(scp: Scp) -> None:
     [
         ({"drag": torch.ones(2)}, "exactly"),
         ({"drag": torch.ones(2), "target": torch.ones(2, 2), "mass": torch.ones(2)}, "exactly"),
-        ({"drag": torch.ones(2), "target": torch.ones(2)}, "target: 'shape"),
+        ({"drag": torch.ones(2), "target": torch.ones(2)}, "target: got 'shape"),
         ({"drag": torch.ones(2), "target": torch.ones(3, 2)}, "shape"),
         ({"drag": torch.ones(()), "target": torch.ones(1, 2)}, "shape"),
     ],

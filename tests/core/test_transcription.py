@@ -14,6 +14,7 @@ from oracles.powered_descent_physics import state_rate
 from dscp_core import problems
 from dscp_core.cone_program import ConeProgram, ConeValues
 from dscp_core.ocp import CostTerm, Variable, Where
+from dscp_core.parameters import Value
 from dscp_core.scp import Scp, ScpOptions, ScpStatus
 from dscp_core.transcription import Transcription
 
@@ -35,7 +36,7 @@ class Case:
         problem = problems.get("powered_descent", formulation)
         self.transcription = Transcription(problem, INTERVALS, free_terminal_time=free)
         rng = np.random.default_rng(11)
-        changes = {
+        changes: dict[str, Value] = {
             "terminal_time": 30.0,
             "final_position": [20.0, -30.0, 10.0],
             "final_velocity": [-1.0, 2.0, 0.5],
@@ -65,7 +66,7 @@ class Case:
         size = self.parameters.size
         sizes = np.concatenate([np.ones(self.reference.size), np.maximum(self.parameters, 1e-3)])
         assert sizes.size == self.reference.size + size
-        return self.rng.standard_normal((count, sizes.size)) * sizes
+        return np.asarray(self.rng.standard_normal((count, sizes.size)) * sizes)
 
 
 @pytest.fixture(scope="module", params=CASES, ids=lambda c: f"{c[0]}-{'free' if c[1] else 'fixed'}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import casadi as ca
@@ -32,7 +33,7 @@ _PARAMETERS = (
 )
 
 
-def _straight(p: dict[str, ca.MX], intervals: int) -> InitialGuess:
+def _straight(p: Mapping[str, ca.MX], intervals: int) -> InitialGuess:
     share = ca.DM(np.linspace(0.0, 1.0, intervals + 1)).T
     states = ca.mtimes(p["start"], 1 - share) + ca.mtimes(p["target"], share)
     return InitialGuess(states, ca.MX(ca.DM.zeros(1, intervals + 1)))

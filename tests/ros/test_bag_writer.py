@@ -333,7 +333,7 @@ def test_wrong_calls_are_named(tmp_path: Path) -> None:
         writer.add_topic("/x", Float64)
         with pytest.raises(InvalidInputError, match="added before: /x"):
             writer.write("/y", Float64(), START_NS)
-        with pytest.raises(InvalidInputError, match=r"'String' violates std_msgs/msg/Float64"):
+        with pytest.raises(InvalidInputError, match=r"'String', expected std_msgs/msg/Float64"):
             writer.write("/x", String(), START_NS)
         with pytest.raises(InvalidInputError, match="log_time_ns: -1"):
             writer.write("/x", Float64(), -1)
@@ -351,7 +351,7 @@ def test_wrong_calls_are_named(tmp_path: Path) -> None:
             writer.add_topic("/z", int)
     with pytest.raises(InvalidInputError, match="open for writing"):
         writer.write("/x", Float64(), START_NS)
-    with pytest.raises(InvalidInputError, match="compression: 'rar'"):
+    with pytest.raises(InvalidInputError, match="compression: got 'rar'"):
         BagWriter(tmp_path / "other", compression="rar")
 
 

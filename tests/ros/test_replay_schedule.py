@@ -88,5 +88,5 @@ def test_window() -> None:
     assert part.length_s == 3.0
     assert replay_window(first, last, 9.0, 100.0).end_ns == last + 1
     assert replay_window(first, last, 10.0, None).start_ns == last
-    with pytest.raises(InvalidInputError, match=r"--start-offset: 10\.5 violates \[0, 10\]"):
+    with pytest.raises(InvalidInputError, match=r"--start-offset: got 10\.5, expected \[0, 10\]"):
         replay_window(first, last, 10.5, None)
