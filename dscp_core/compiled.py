@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
 import casadi as ca
@@ -29,6 +29,23 @@ class CompiledFunction:
             self._buffer.set_arg(index, memoryview(argument.data))
         for index, result in enumerate(self._results):
             self._buffer.set_res(index, memoryview(result.data))
+
+    def of_first(self, *others: Array) -> Callable[[Array], Array]:
+        """The first output as a function of the first argument, the others held.
+
+        For integrators, where most of a call's time would go into copying what does not change.
+        The result holds until the next call of either.
+        """
+        for target, argument in zip(self._arguments[1:], others, strict=True):
+            target[:] = argument
+        first, result, trigger = self._arguments[0], self._results[0], self._trigger
+
+        def evaluate(argument: Array) -> Array:
+            first[:] = argument
+            trigger()
+            return result.copy()
+
+        return evaluate
 
     def __call__(self, *arguments: Array) -> tuple[Array, ...]:
         """Evaluate; returns fresh flat arrays, column-major for matrices."""

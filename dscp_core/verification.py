@@ -8,6 +8,7 @@ what is certified, and by the constraints between the nodes.
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
 
@@ -149,11 +150,16 @@ class PlanVerifier:
         self._rates = CompiledFunction("rates", [x, u, packed], [scaled_rates])
         self._checked = tuple(constraints(problem, Where.NODE))
         point = StagePoint(x, u, ca.SX(0.0))
-        self._limits = CompiledFunction(
+        limits = ca.Function(
             "limits",
             [x, u, packed],
             [ca.vertcat(*(_violation(c, point, parameters) for c in self._checked), ca.SX(0, 1))],
         )
+        self._points = intervals * substeps + 1
+        grid = [ca.MX.sym("x", nx, self._points), ca.MX.sym("u", nu, self._points)]
+        grid.append(ca.MX.sym("p", problem.table.size))
+        mapped = limits.map("limits_on_grid", "serial", self._points, [2], [])
+        self._limits = CompiledFunction("limits_on_grid", grid, [mapped(*grid)])
         self._misses = CompiledFunction(
             "misses",
             [x, packed],
@@ -187,8 +193,7 @@ class PlanVerifier:
             missed = self._misses(flown[-1], parameters)[0]
             for miss, value in zip(self._problem.misses, missed, strict=True):
                 checks.append(_check(miss.name, value, miss.tolerance, miss.unit, times[-1]))
-        pairs = zip(flown, applied, strict=True)
-        values = np.array([self._limits(x, u, parameters)[0] for x, u in pairs])
+        values = self._limits_along(flown, applied, parameters)
         for column, constraint in enumerate(self._checked):
             worst = int(np.argmax(values[:, column]))
             checks.append(
@@ -222,29 +227,29 @@ class PlanVerifier:
             mass_used_kg=used,
         )
 
+    def _limits_along(self, flown: Array, applied: Array, parameters: Array) -> Array:
+        """Violation of every constraint at every point, (M, constraints)."""
+        # A flight that ended early is filled up with its last point.
+        index = np.minimum(np.arange(self._points), len(flown) - 1)
+        violations = self._limits(flown[index].ravel(), applied[index].ravel(), parameters)[0]
+        return violations.reshape(self._points, -1)[: len(flown)]
+
     def _fly(
         self, times_s: Array, start: Array, controls: Array, parameters: Array
     ) -> tuple[tuple[Array, Array, Array], str | None]:
         """Fine grid with states and controls, and why the integration ended early."""
-        applied_now = controls[0]
-        slope = np.zeros_like(applied_now)
-        origin = times_s[0]
-
-        def rates(x: Array, t: float) -> Array:
-            return self._rates(x, applied_now + (t - origin) * slope, parameters)[0]
-
         grid, flown, applied = [times_s[:1]], [start[None, :] / self._scale], []
         for n in range(self._intervals):
             # Restarted at every node: the controls or their rates jump there.
             origin, end = times_s[n], times_s[n + 1]
             if self._hold is ControlHold.MEAN:
-                applied_now = 0.5 * (controls[n] + controls[n + 1])
+                held, slope = 0.5 * (controls[n] + controls[n + 1]), np.zeros(controls.shape[1])
             else:
-                applied_now, slope = controls[n], (controls[n + 1] - controls[n]) / (end - origin)
+                held, slope = controls[n], (controls[n + 1] - controls[n]) / (end - origin)
             moments = np.linspace(origin, end, self._substeps + 1)
-            applied.append(applied_now + np.outer(moments[:-1] - origin, slope))
+            applied.append(held + np.outer(moments[:-1] - origin, slope))
             reached, details = scipy.integrate.odeint(
-                rates,
+                self._right_hand_side(origin, held, slope, parameters),
                 flown[-1][-1],
                 moments,
                 rtol=self._relative_tolerance,
@@ -256,8 +261,17 @@ class PlanVerifier:
                 return _stacked(grid, flown, applied, self._scale), failure
             grid.append(moments[1:])
             flown.append(reached[1:])
-        applied.append((applied_now + (times_s[-1] - origin) * slope)[None, :])
+        applied.append((held + (times_s[-1] - origin) * slope)[None, :])
         return _stacked(grid, flown, applied, self._scale), None
+
+    def _right_hand_side(
+        self, origin: float, held: Array, slope: Array, parameters: Array
+    ) -> Callable[[Array, float], Array]:
+        """Scaled rates of (state, time) on one interval."""
+        if not slope.any():
+            rates = self._rates.of_first(held, parameters)
+            return lambda x, _t: rates(x)
+        return lambda x, t: self._rates(x, held + (t - origin) * slope, parameters)[0]
 
 
 def _stacked(

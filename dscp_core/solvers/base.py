@@ -40,7 +40,7 @@ class SolverSettings:
         InvalidInputError: On construction, for a value out of range.
     """
 
-    tolerance: float = 1e-10
+    tolerance: float = 1e-9
     acceptable_tolerance: float = 1e-5
     max_iterations: int = 100
 
