@@ -177,9 +177,7 @@ def implicit(
     # Where the cost is flat it converges long before the trajectory does.
     drift = float(np.max(np.abs(reference - solution.z[:size])))
     if drift > 1e-5:
-        reasons += (
-            f"not settled: another iteration moves it by {drift:.1e} (scaled)",
-        )
+        reasons += (f"not settled: another iteration moves it by {drift:.1e} (scaled)",)
     return Gradient(
         value=loss.value(transcription, trace),
         parameters=parameters,
@@ -222,6 +220,8 @@ def tangent(scp: Scp, trace: ScpResult, direction: Array) -> Tangent:
 
 
 def _linearise(scp: Scp, iteration: Iteration) -> Linearisation:
+    if iteration.linearisation is not None:
+        return iteration.linearisation
     return scp.kkt.linearise(iteration.values, iteration.solution)
 
 

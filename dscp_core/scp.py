@@ -198,14 +198,17 @@ class _Run:
         solved = time.perf_counter()
         if solution.status is not SolveStatus.SOLVED:
             return solution, before
+        linearisation = None
         if self._options.polish:
-            solution = self._scp.kkt.linearise(values, solution).solution
+            linearisation = self._scp.kkt.linearise(values, solution)
+            solution = linearisation.solution
         polished = time.perf_counter()
         evaluation = transcription.evaluate(solution.z[: reference.size], self._parameters)
         iteration = Iteration(
             reference=reference,
             values=values,
             solution=solution,
+            linearisation=linearisation,
             cost=evaluation.cost,
             penalised_cost=evaluation.cost / transcription.problem.cost_scale
             + _virtual_penalty(layout.reference_size, transcription.pattern, values, solution.z),

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dscp_core.cone_program import ConeSolution, ConeValues
+from dscp_core.sensitivity import Linearisation
 
 Array = NDArray[np.float64]
 
@@ -34,6 +35,7 @@ class Iteration:
         reference: Scaled reference vector that the subproblem was built about.
         values: The subproblem's values.
         solution: Its solution, polished when `ScpOptions.polish` is set.
+        linearisation: Derivatives at that solution, made by the polish; None without it.
         cost: True cost J of the solution's trajectory, in its own units.
         penalised_cost: J plus the virtual-control penalty, scaled.
         predicted_change: Change of the subproblem's objective from reference to solution, scaled.
@@ -47,6 +49,7 @@ class Iteration:
     reference: Array
     values: ConeValues
     solution: ConeSolution
+    linearisation: Linearisation | None
     cost: float
     penalised_cost: float
     predicted_change: float

@@ -29,7 +29,7 @@ class TrustLimits:
     """
 
     kkt_residual: float = 1e-6
-    weak_margin: float = 1e-10
+    weak_margin: float = 2e-11
     singularity: float = 0.1
     solve_residual: float = 1e-8
 

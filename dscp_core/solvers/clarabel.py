@@ -23,9 +23,9 @@ _CLAIMS = {
 class ClarabelSolver:
     """Backend for https://clarabel.org; the time limit is enforced between iterations.
 
-    Programs of a transcription are scaled by their declaration, so Clarabel's own equilibration is
-    off: it would be that of the first program for all later ones. A program that fails without it
-    is solved once more with a fresh, equilibrated set-up.
+    Clarabel's iterative refinement is off: on the powered-descent subproblems it doubles the time
+    and changes neither status nor iterations. A program that fails without it is solved once more,
+    with refinement and a fresh set-up.
     """
 
     name = "clarabel"
@@ -39,7 +39,7 @@ class ClarabelSolver:
         self._settings.presolve_enable = False  # presolve forbids data updates
         self._settings.input_sparse_dropzeros = False
         self._settings.max_threads = 1
-        self._settings.equilibrate_enable = False
+        self._settings.iterative_refinement_enable = False
         self._settings.max_iter = settings.max_iterations
         self._settings.tol_feas = settings.tolerance
         self._settings.tol_gap_abs = settings.tolerance
@@ -71,12 +71,12 @@ class ClarabelSolver:
             self._settings.time_limit = time_limit_s - (time.perf_counter() - start)
             if self._settings.time_limit <= 0.0:
                 return solution
-        self._settings.equilibrate_enable = True
+        self._settings.iterative_refinement_enable = True
         try:
-            equilibrated = self._set_up(values, stacked, right)
+            careful = self._set_up(values, stacked, right)
         finally:
-            self._settings.equilibrate_enable = False
-        return self._answer(values, equilibrated, start, setup_seconds)
+            self._settings.iterative_refinement_enable = False
+        return self._answer(values, careful, start, setup_seconds)
 
     def _answer(
         self, values: ConeValues, solver: Any, start: float, setup_seconds: float

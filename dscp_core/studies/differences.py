@@ -179,7 +179,7 @@ class RunDifferences:
             return None
         for iteration in trace.iterations:
             # An unpolished solution is off by the solver's tolerance, 1e4 times the rounding.
-            if not self._scp.kkt.linearise(iteration.values, iteration.solution).verdict.polished:
+            if iteration.linearisation is None or not iteration.linearisation.verdict.polished:
                 return None
         return self._loss.value(self._scp.transcription, trace)
 

@@ -97,14 +97,16 @@ def test_weight_at_its_lower_bound_is_checked_from_one_side(gradient: Any) -> No
     assert code == ExitCode.OK
     assert answer["check"]["trust_region_step"]["kind"] == "forward"
     assert answer["gradient"]["trust_region_step"] == 0.0  # the terminal time is fixed
+    largest = max(map(abs, answer["gradient"]["trust_region_control"]))
     for component, check in enumerate(answer["check"]["trust_region_control"]):
         assert check["kind"] == "forward"
         gap = (
             answer["gradient"]["trust_region_control"][component]
             - answer["central_difference"]["trust_region_control"][component]
         )
-        # The uncertainty is the disagreement of two extrapolations, not a bound.
-        assert abs(gap) <= 10.0 * check["uncertainty"]
+        # The uncertainty is the disagreement of two extrapolations, not a bound; the noise of
+        # the runs (1e-11 kg over a step of 1e-3) stands beside it.
+        assert abs(gap) <= max(10.0 * check["uncertainty"], 1e-7 * largest)
 
 
 def test_step_is_shortened_to_stay_within_the_active_set(gradient: Any) -> None:
