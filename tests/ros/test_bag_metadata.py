@@ -74,7 +74,7 @@ def test_version_4(tmp_path: Path) -> None:
         (VERSION_4.replace("version: 4", "version: 10"), r"version 10 is not in \[1, 9\]"),
         (VERSION_4.replace("  message_count: 10\n", "", 1), "message_count"),
         (VERSION_4.replace("message_count: 10", "message_count: ten"), "ten"),
-        (VERSION_4.replace("durability: 2", "durability: 77"), "durability: 77"),
+        (VERSION_4.replace("durability: 2", "durability: 77"), "durability: got 77"),
         (
             VERSION_4.replace("topics_with_message_count:", "topics_with_message_count: 5\n  x:"),
             "iterable",

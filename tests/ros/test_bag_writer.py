@@ -335,7 +335,7 @@ def test_wrong_calls_are_named(tmp_path: Path) -> None:
             writer.write("/y", Float64(), START_NS)
         with pytest.raises(InvalidInputError, match=r"'String', expected std_msgs/msg/Float64"):
             writer.write("/x", String(), START_NS)
-        with pytest.raises(InvalidInputError, match="log_time_ns: -1"):
+        with pytest.raises(InvalidInputError, match="log_time_ns: got -1"):
             writer.write("/x", Float64(), -1)
         with pytest.raises(InvalidInputError, match="absolute name"):
             writer.add_topic("relative", Float64)

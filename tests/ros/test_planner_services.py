@@ -95,7 +95,7 @@ def test_reload_takes_the_file_over_as_a_whole(ros, tmp_path):
 @pytest.mark.parametrize(
     ("values", "words"),
     [
-        ({"intervals": "1", "deadline_s": "0.7"}, "intervals: 1"),
+        ({"intervals": "1", "deadline_s": "0.7"}, "intervals: got 1"),
         ({"deadline_s": "0.7", "parameters.thrust_max": "-1.0"}, "thrust_max"),
         ({"deadline_s": "0.7", "dedline_s": "1.0"}, "did you mean deadline_s"),
         ({"deadline_s": "1"}, "a number with a point"),

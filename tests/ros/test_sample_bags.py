@@ -140,8 +140,9 @@ def test_the_script_makes_the_dispersed_bag_again(generate: ModuleType, tmp_path
 def test_the_script_makes_the_nominal_bag_again(generate: ModuleType, tmp_path: Path) -> None:
     """A closed loop: rounding differs between machines, the solver's answer with it.
 
-    Another solver moves this flight by 0.07 m, 0.11 m/s, 1.7 kg and 10 kN of thrust, that is
-    0.01 of tilt; another machine with the same solver does less.
+    Another solver, or another tolerance of it, moves this flight by 0.07 m, 0.11 m/s, 2.5 kg and
+    10 kN of thrust, that is 0.01 of tilt; another machine with the same solver does less. The
+    limits are about twice that.
     """
     again, kept = (decoded(bag) for bag in (generate.write_nominal(tmp_path), FOLDER / NOMINAL))
     assert Counter(topic for topic, _, _ in again) == Counter(topic for topic, _, _ in kept)
@@ -157,11 +158,11 @@ def test_the_script_makes_the_nominal_bag_again(generate: ModuleType, tmp_path: 
                 continue
             assert stamp_ns(new) == pytest.approx(stamp_ns(old), abs=10_000_000, rel=0.0)
             if topic == MASS:
-                assert new.inertia.m == pytest.approx(old.inertia.m, abs=2.0)
+                assert new.inertia.m == pytest.approx(old.inertia.m, abs=5.0)
                 continue
             fresh, stored = numbers(STATE, new)[2:], numbers(STATE, old)[2:]
             # Body axes turn with the tilt: 0.01 of 230 m/s.
-            tolerance = np.repeat([0.1, 2.5, 0.02], [3, 3, 4])
+            tolerance = np.repeat([0.15, 2.5, 0.02], [3, 3, 4])
             assert np.all(np.abs(fresh - stored) <= tolerance)
 
 
