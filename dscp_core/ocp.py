@@ -79,7 +79,8 @@ class Constraint:
         where: Node or interval mean.
         skip_first: Leave out the first node or interval (its state is pinned).
         skip_last: Leave out the last node or interval.
-        tolerance: Violation of the flown trajectory that a certificate accepts, in ``unit``.
+        tolerance: Violation of the flown trajectory that a certificate accepts, in ``unit``; a
+            function of the parameters' values where it grows with the vehicle.
     """
 
     name: str
@@ -89,7 +90,11 @@ class Constraint:
     where: Where = Where.NODE
     skip_first: bool = False
     skip_last: bool = False
-    tolerance: float = 0.0
+    tolerance: float | Callable[[Mapping[str, Any]], float] = 0.0
+
+    def accepted(self, values: Mapping[str, Any]) -> float:
+        """The tolerance for a vehicle's values by name."""
+        return self.tolerance(values) if callable(self.tolerance) else self.tolerance
 
 
 class PathConstraint(Constraint):

@@ -194,13 +194,14 @@ class PlanVerifier:
             for miss, value in zip(self._problem.misses, missed, strict=True):
                 checks.append(_check(miss.name, value, miss.tolerance, miss.unit, times[-1]))
         values = self._limits_along(flown, applied, parameters)
+        named_values = self._problem.table.unpack(parameters)
         for column, constraint in enumerate(self._checked):
             worst = int(np.argmax(values[:, column]))
             checks.append(
                 _check(
                     constraint.name,
                     values[worst, column],
-                    constraint.tolerance,
+                    constraint.accepted(named_values),
                     constraint.unit,
                     times[worst],
                 )

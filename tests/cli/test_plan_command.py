@@ -16,6 +16,7 @@ from dscp_ros.cli.main import main
 from dscp_ros.cli.output_files import complete_file
 
 # An independent solution of the same discretised problem (CasADi + IPOPT).
+VEHICLES = Path(__file__).parents[2] / "config" / "vehicles"
 OPTIMAL_TIME_S = 32.8103
 OPTIMAL_MASS_KG = 31760.30
 LEAST_TIME_S = 32.0487
@@ -142,6 +143,16 @@ def test_bad_input_names_the_field(plan: Any, arguments: list[str], field: str) 
 def test_unknown_problem(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["plan", "ascent"]) == ExitCode.BAD_INPUT
     assert "problem: got 'ascent', expected one of powered_descent" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("vehicle", sorted(VEHICLES.glob("*.yaml")), ids=lambda path: path.stem)
+def test_shipped_vehicles_land(plan: Any, vehicle: Path) -> None:
+    code, answer = plan("--vehicle", str(vehicle), "--free-terminal-time")
+    assert code == ExitCode.OK, answer["message"]
+    assert answer["certified"] is True
+    bounds = {c["name"]: c["bound"] for c in answer["certificate"]["checks"]}
+    # A tolerance in N that suits one vehicle is nothing for another.
+    assert bounds["thrust_max"] == pytest.approx(1e-3 * answer["parameters"]["thrust_max"])
 
 
 def test_vehicle_file_sets_parameters_and_set_wins(plan: Any, tmp_path: Path) -> None:

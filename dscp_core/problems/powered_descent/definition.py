@@ -74,6 +74,10 @@ def dynamics(x: ca.SX, u: ca.SX, p: Parameters) -> ca.SX:
     return ca.vertcat(x[3:6], u / mass + gravity, -_mass_flow_per_thrust(p) * norm(u))
 
 
+def _thrust_tolerance_n(values: Mapping[str, Any]) -> float:
+    return _THRUST_TOLERANCE * float(values["thrust_max"])
+
+
 def _thrust_floor(point: StagePoint, p: Parameters) -> ca.SX:
     return p["thrust_min"] - norm(point.u)
 
@@ -167,12 +171,12 @@ _FINAL_STATE = {
 }
 
 # What a certificate accepts: 0.1 % of thrust_max, and what landing sites are surveyed to.
-_THRUST_TOLERANCE_N = 850.0
+_THRUST_TOLERANCE = 1e-3
 _POSITION_TOLERANCE_M = 1.0
 _SPEED_TOLERANCE_M_S = 0.5
 
 _THRUST_FLOOR = PathConstraint(
-    "thrust_min", _thrust_floor, _THRUST_N, "N", tolerance=_THRUST_TOLERANCE_N
+    "thrust_min", _thrust_floor, _THRUST_N, "N", tolerance=_thrust_tolerance_n
 )
 # The midpoint rule burns |mean thrust|: alternating nodal directions would otherwise fly on less
 # than thrust_min.
@@ -180,13 +184,13 @@ _MEAN_THRUST_FLOOR = PathConstraint(
     "mean_thrust_min", _mean_thrust_floor, _THRUST_N, "N", where=Where.MEAN
 )
 _LINEARISED_THRUST_CEILING = PathConstraint(
-    "thrust_max", _thrust_ceiling, _THRUST_N, "N", tolerance=_THRUST_TOLERANCE_N
+    "thrust_max", _thrust_ceiling, _THRUST_N, "N", tolerance=_thrust_tolerance_n
 )
 _THRUST_CONE = ConeConstraint(
-    "thrust_max", _thrust_cone, _THRUST_N, "N", tolerance=_THRUST_TOLERANCE_N
+    "thrust_max", _thrust_cone, _THRUST_N, "N", tolerance=_thrust_tolerance_n
 )
 _CONES = (
-    ConeConstraint("pointing", _pointing_cone, _THRUST_N, "N", tolerance=_THRUST_TOLERANCE_N),
+    ConeConstraint("pointing", _pointing_cone, _THRUST_N, "N", tolerance=_thrust_tolerance_n),
     # Node 0 is pinned; at the end the vehicle stands on the cone's apex.
     ConeConstraint(
         "glideslope",
