@@ -77,9 +77,8 @@ class _TimedPlanner:
     """A planner with free terminal time whose plans are timed, and their certificates apart."""
 
     def __init__(self, solver: str) -> None:
-        self._planner = Planner(
-            PlannerSettings(terminal_time=TerminalTime.FREE, options=ScpOptions(solver=solver))
-        )
+        options = ScpOptions(solver=solver, cost_tolerance=1e-6)  # as the node's default
+        self._planner = Planner(PlannerSettings(terminal_time=TerminalTime.FREE, options=options))
         intervals = self._planner.settings.intervals
         self._verifier = PlanVerifier(self._planner.problem, intervals)
         self._planner.plan(self._planner.initial_state)  # pays for the solver's set-up

@@ -34,6 +34,8 @@ RELIABLE = "reliable"
 BEST_EFFORT = "best_effort"
 
 _OPTIONS = ScpOptions()
+_COST_TOLERANCE = 1e-6
+"""Looser than the core's: 0.03 kg of the paper's rocket, for which a late plan is no fair price."""
 _INPUTS = InputSettings()
 _LIMITS = InputLimits()
 
@@ -314,7 +316,7 @@ _PLANNING = (
     NodeParameter("max_iterations", _OPTIONS.max_iterations, "Iteration limit.", "", 1, 1000),
     NodeParameter(
         "cost_tolerance",
-        _OPTIONS.cost_tolerance,
+        _COST_TOLERANCE,
         "Converged when the cost changes by less, relatively.",
         "1",
         1e-15,
