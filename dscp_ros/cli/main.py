@@ -27,6 +27,8 @@ COMMANDS: dict[str, Command] = {
     "plan": Command("dscp_ros.cli.plan_command", "solve one case, without ROS"),
     "gradient": Command("dscp_ros.cli.gradient_command", "differentiate a plan, without ROS"),
     "study": Command("dscp_ros.cli.study_commands", "reproduce a published result"),
+    "train": Command("dscp_ros.cli.train_command", "train the terminal-time network"),
+    "evaluate": Command("dscp_ros.cli.evaluate_command", "measure a network against brute force"),
     "planner": Command("dscp_ros.cli.planner_command", "run the planner as a ROS 2 node"),
     "replay": Command("dscp_ros.cli.replay_command", "publish a bag's messages on ROS 2 topics"),
     "bag": Command("dscp_ros.cli.bag_commands", "look into, check and repair MCAP bags"),

@@ -1,0 +1,1 @@
+"""Learning the optimal terminal time of powered descent (section 4.1.3)."""

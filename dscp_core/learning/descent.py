@@ -1,0 +1,91 @@
+"""The paper's training: stochastic gradient descent on DSCP's gradients (section 4.1.3)."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from dscp_core.learning.labels import given_times
+from dscp_core.learning.recipes import Descent
+from dscp_core.learning.run import Run
+from dscp_core.scp import ScpOptions
+
+Array = NDArray[np.float64]
+
+
+def descend(run: Run) -> None:
+    """Train epoch by epoch."""
+    settings = run.recipe.descent
+    if settings is None:
+        return
+    progress = run.document.setdefault("descent", {"epoch": 0})
+    optimiser = torch.optim.Adam(run.network.parameters(), lr=settings.learning_rate(0))
+    _restore(run, optimiser)
+    with run.bar(settings.epochs, "epochs", progress["epoch"]) as bar:
+        while progress["epoch"] < settings.epochs:
+            epoch = progress["epoch"]
+            rate = settings.learning_rate(epoch)
+            for group in optimiser.param_groups:
+                group["lr"] = rate
+            slope, failures = _epoch(run, settings, optimiser, epoch)
+            progress["epoch"] += 1
+            last = progress["epoch"] == settings.epochs
+            if last or progress["epoch"] % settings.validate_every == 0:
+                errors = run.record(
+                    "descent",
+                    epoch=progress["epoch"],
+                    learning_rate=rate,
+                    mean_abs_slope=slope,
+                    failures=failures,
+                )
+                bar.set_postfix(
+                    slope=f"{slope:.2g}", failures=failures, validation=f"{errors.rms:.1e}"
+                )
+            bar.update()
+            _keep(run, optimiser)
+            run.save(even_if_recent=False)
+    run.use_best()
+
+
+def _epoch(
+    run: Run, settings: Descent, optimiser: torch.optim.Optimizer, epoch: int
+) -> tuple[float, int]:
+    """One epoch; returns mean absolute slope in slope units, and how many states failed."""
+    options = ScpOptions.for_gradients(max_iterations=settings.max_iterations)
+    states = run.box.uniform(settings.samples, run.rng("descent", epoch))
+    total, failures = 0.0, 0
+    for start in range(0, len(states), settings.batch):
+        batch = states[start : start + settings.batch]
+        optimiser.zero_grad()
+        times = run.network(run.network.inputs(batch))
+        outcome = given_times(
+            run.engine, batch, times.detach().numpy(), options, method=settings.method
+        )
+        limit = settings.slope_limit
+        slopes = np.clip(outcome.slope_kg_s / settings.slope_unit_kg_s, -limit, limit)
+        failed = ~(outcome.converged & np.isfinite(slopes))
+        slopes = np.where(failed, settings.failed_slope, slopes)
+        times.backward(torch.from_numpy(slopes / len(batch)))
+        optimiser.step()
+        total += float(np.sum(np.abs(slopes)))
+        failures += int(np.count_nonzero(failed))
+    return total / len(states), failures
+
+
+def _keep(run: Run, optimiser: torch.optim.Optimizer) -> None:
+    """Copy the optimiser's tensors to the run's arrays."""
+    for number, values in optimiser.state_dict()["state"].items():
+        for name, tensor in values.items():
+            run.arrays[f"adam.{number}.{name}"] = tensor.numpy().copy()
+
+
+def _restore(run: Run, optimiser: torch.optim.Optimizer) -> None:
+    """Inverse of `_keep`."""
+    state: dict[int, dict[str, torch.Tensor]] = {}
+    for key, array in run.arrays.items():
+        if key.startswith("adam."):
+            _, number, name = key.split(".")
+            state.setdefault(int(number), {})[name] = torch.from_numpy(array.copy())
+    if state:
+        optimiser.load_state_dict({**optimiser.state_dict(), "state": state})

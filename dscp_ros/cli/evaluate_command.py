@@ -1,0 +1,250 @@
+"""`dscp evaluate`: measure what was learnt against brute force."""
+
+from __future__ import annotations
+
+import argparse
+import os
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from dscp_core.errors import InvalidInputError
+from dscp_ros.cli import ExitCode
+from dscp_ros.cli.arguments import overrides, print_json, print_table
+from dscp_ros.cli.output_files import complete_file
+
+if TYPE_CHECKING:
+    from dscp_core.learning.evaluation import Measurement
+
+DESCRIPTION = "Measures what was learnt against brute force."
+
+EPILOG = """\
+examples:
+  dscp evaluate terminal-time --quick
+  dscp evaluate terminal-time out/training/terminal_time.safetensors --output out/evaluation
+"""
+
+TERMINAL_TIME_DESCRIPTION = """\
+Compares the predicted terminal times with the optimal ones, which are computed with the terminal
+time as a decision, on three sets of states:
+
+  vertical    r_x and v_x over the box, r_y = r_z = 100 m, no lateral velocity
+  horizontal  r_y and r_z over the box, r_x = 5200 m, v_x = -135 m/s, no lateral velocity
+  box         random states of the whole box
+
+and plans at the predicted times: fuel lost against the optimum, and how many predictions are too
+short to land in. In these plans the mean thrust of every interval keeps its lower bound, so that
+alternating thrust directions gain nothing. Some optima are computed again by IPOPT.
+"""
+
+TERMINAL_TIME_EPILOG = """\
+examples:
+  dscp evaluate terminal-time --quick                (the two profiles only, below a minute)
+  dscp evaluate terminal-time --json
+  dscp evaluate terminal-time --samples 10000 --output out/evaluation
+"""
+
+PROFILE_POINTS = 11
+LATERAL_POINTS = 21
+IPOPT_STATES = 20
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Declares the command."""
+    parser = subparsers.add_parser(
+        "evaluate", help="measure what was learnt", description=DESCRIPTION, epilog=EPILOG
+    )
+    parts = parser.add_subparsers(title="what to evaluate", metavar="WHAT", required=True)
+    _add_terminal_time(parts)
+
+
+def _add_terminal_time(parts: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    parser = parts.add_parser(
+        "terminal-time",
+        help="the network that predicts the terminal time",
+        description=TERMINAL_TIME_DESCRIPTION,
+        epilog=TERMINAL_TIME_EPILOG,
+    )
+    parser.add_argument(
+        "network", nargs="?", type=Path, metavar="NETWORK", help="its file (default: the built-in)"
+    )
+    parser.add_argument("--quick", action="store_true", help="the two profiles only")
+    parser.add_argument(
+        "--samples",
+        type=int,
+        default=1000,
+        metavar="N",
+        help="states of the box whose optimum is computed (default %(default)s)",
+    )
+    parser.add_argument(
+        "--feasibility-samples",
+        type=int,
+        default=10000,
+        metavar="N",
+        help="further states of the box planned at the predicted time (default %(default)s)",
+    )
+    parser.add_argument(
+        "--seed", type=int, default=1, metavar="N", help="of the random states (default 1)"
+    )
+    parser.add_argument(
+        "--workers", type=int, metavar="N", help="processes (default: one per processor)"
+    )
+    parser.add_argument(
+        "--output", type=Path, metavar="DIR", help="draw the two profiles into this directory"
+    )
+    parser.add_argument("--json", action="store_true", help="print the result as JSON on stdout")
+    group = parser.add_argument_group("vehicle")
+    group.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        dest="assignments",
+        metavar="NAME=VALUE",
+        help="set a parameter in SI units; the network must have been trained for it",
+    )
+    group.add_argument(
+        "--vehicle", type=Path, metavar="FILE", help="YAML file of parameter names and SI values"
+    )
+    parser.set_defaults(run=run_terminal_time)
+
+
+def run_terminal_time(args: argparse.Namespace) -> int:
+    """Measures, draws, prints.
+
+    Returns:
+        The exit code.
+
+    Raises:
+        InvalidInputError: A value that cannot be used, or a network of another vehicle.
+    """
+    for name in ("samples", "feasibility_samples"):
+        if getattr(args, name) < 1:
+            raise InvalidInputError(f"--{name.replace('_', '-')}", getattr(args, name), ">= 1")
+    if args.output is not None and args.output.exists() and not args.output.is_dir():
+        raise InvalidInputError("--output", str(args.output), "a directory")
+    import numpy as np
+    from tqdm import tqdm
+
+    from dscp_core import problems
+    from dscp_core.learning import evaluation
+    from dscp_core.learning.evaluator import DescentModel
+    from dscp_core.learning.parallel import ProcessEngine
+    from dscp_core.learning.sampling import PAPER_BOX, horizontal_profile, vertical_profile
+    from dscp_core.problems import powered_descent
+    from dscp_core.terminal_time import DEFAULT_NETWORK, FeatureMap, TerminalTimeNetwork
+
+    table = problems.get(powered_descent.NAME).table
+    parameters = overrides(args)
+    network = TerminalTimeNetwork.load(
+        DEFAULT_NETWORK if args.network is None else args.network,
+        vehicle=table.unpack(table.pack(parameters)),
+    )
+    model = DescentModel({**parameters, "mean_thrust_fraction": 1.0}, None, network.data.intervals)
+    workers = len(os.sched_getaffinity(0)) if args.workers is None else args.workers
+    rng = np.random.default_rng(args.seed)
+    sets = {
+        "vertical": vertical_profile(PROFILE_POINTS),
+        "horizontal": horizontal_profile(LATERAL_POINTS),
+    }
+    if not args.quick:
+        sets["box"] = PAPER_BOX.uniform(args.samples, rng)
+    measurements: dict[str, Measurement] = {}
+    document: dict[str, Any] = {"vertical": None, "horizontal": None, "box": None}
+    engine = ProcessEngine(model, workers)
+    try:
+        for name, states in sets.items():
+            with tqdm(desc=name, unit="plan", disable=None) as bar:
+                measurements[name] = evaluation.measure(
+                    engine,
+                    network.evaluate,
+                    states,
+                    symmetric=network.data.features is FeatureMap.AXISYMMETRIC,
+                    progress=bar.update,
+                )
+            document[name] = measurements[name].document()
+        if not args.quick:
+            further = PAPER_BOX.uniform(args.feasibility_samples, rng)
+            with tqdm(desc="feasibility", total=len(further), unit="plan", disable=None) as bar:
+                refused = evaluation.infeasible_predictions(
+                    engine, network.evaluate, further, progress=bar.update
+                )
+            document["feasibility"] = {"states": len(further), "infeasible": len(refused)}
+            with tqdm(desc="IPOPT", total=IPOPT_STATES, unit="state", disable=None) as bar:
+                checked = PAPER_BOX.uniform(IPOPT_STATES, rng)
+                check = evaluation.check_against_ipopt(engine, model, checked, bar.update)
+            document["ipopt"] = asdict(check)
+    finally:
+        engine.close()
+    files = [] if args.output is None else _draw(args.output, measurements)
+    document["files"] = [str(path) for path in files]
+    if args.json:
+        print_json(document)
+    else:
+        _print(document)
+    return ExitCode.OK
+
+
+def _draw(output: Path, measurements: dict[str, Measurement]) -> list[Path]:
+    from dscp_core.learning.figures import profile_figure
+
+    output.mkdir(parents=True, exist_ok=True)
+    axes = {
+        "vertical": ((3, 0), ("v_x [m/s]", "r_x [m]")),
+        "horizontal": ((1, 2), ("r_y [m]", "r_z [m]")),
+    }
+    files = []
+    for name, (columns, labels) in axes.items():
+        path = output / f"terminal_time_{name}.png"
+        with complete_file(path) as partial:
+            profile_figure(
+                measurements[name], columns, labels, f"Terminal-time network, {name} profile"
+            ).savefig(partial)
+        files.append(path)
+    return files
+
+
+def _print(document: dict[str, Any]) -> None:
+    rows = []
+    for name in ("vertical", "horizontal", "box"):
+        figures = document[name]
+        if figures is not None:
+            rows.append(
+                (
+                    name,
+                    str(figures["states"]),
+                    *(f"{figures[f'{key}_relative_error']:.1e}" for key in ("mean", "p99", "max")),
+                    *(_text(figures[f"{key}_fuel_lost_kg"]) for key in ("mean", "p99", "max")),
+                    str(figures["infeasible"]),
+                    str(figures["unsolved"]),
+                )
+            )
+    print_table(
+        (
+            "",
+            "states",
+            "error mean",
+            "p99",
+            "max",
+            "fuel lost mean",
+            "p99",
+            "max [kg]",
+            "infeasible",
+            "no optimum",
+        ),
+        rows,
+    )
+    if "feasibility" in document:
+        part = document["feasibility"]
+        print(f"infeasible predictions among {part['states']} further states: {part['infeasible']}")
+    if "ipopt" in document:
+        part = document["ipopt"]
+        print(
+            f"optimal times against IPOPT, {part['states']} states: relative difference at most "
+            f"{part['max_relative_difference']:.1e} ({part['failed']} not solved by IPOPT)"
+        )
+    for path in document["files"]:
+        print(f"wrote {path}")
+
+
+def _text(value: float | None) -> str:
+    return "-" if value is None else f"{value:.4f}"
