@@ -57,7 +57,7 @@ class Supervised:
     """
 
     phases: tuple[Phase, ...] = (
-        Phase(4096, Fit(steps=400, damping=(1e-3, 1e-5))),
+        Phase(4096, Fit(steps=150, damping=(1e-3, 1e-5))),
         Phase(20480, Fit(damping=(1e-5, 1e-6))),
     )
 
@@ -86,7 +86,7 @@ class Refinement:
     """
 
     rounds: int = 2
-    states: int = 4096
+    states: int = 2048
     fit: Fit = field(default_factory=lambda: Fit(steps=500, damping=(1e-6, 1e-6)))
     step_limit_s: float = 0.5
     curvature_guess: float = 500.0
