@@ -13,9 +13,9 @@ from dscp_core import problems
 from dscp_core.learning.evaluator import BestTimeJob, DescentModel, Job, Outcome
 from dscp_core.learning.labels import TRUTH, Progress, best_time_jobs, given_times, run_jobs
 from dscp_core.learning.nonlinear import NonlinearProgram
-from dscp_core.learning.parallel import Engine
 from dscp_core.learning.run import Errors
 from dscp_core.ocp import TERMINAL_TIME
+from dscp_core.parallel import Engine
 from dscp_core.problems import powered_descent
 from dscp_core.scp import ScpOptions
 from dscp_core.terminal_time import FeatureMap

@@ -17,7 +17,7 @@ from dscp_core.learning.evaluator import (
     Job,
     Outcome,
 )
-from dscp_core.learning.parallel import Engine
+from dscp_core.parallel import Engine
 from dscp_core.scp import ScpOptions
 from dscp_core.solvers import SolverSettings
 

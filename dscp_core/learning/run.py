@@ -19,9 +19,9 @@ from dscp_core.learning.checkpoint import CHECKPOINT_FILE, Checkpoint, Checkpoin
 from dscp_core.learning.evaluator import Job, Outcome
 from dscp_core.learning.labels import LABELLING, best_times
 from dscp_core.learning.network_torch import TorchNetwork
-from dscp_core.learning.parallel import Engine
 from dscp_core.learning.recipes import Recipe
 from dscp_core.learning.sampling import PAPER_BOX, StateBox
+from dscp_core.parallel import Engine
 
 Array = NDArray[np.float64]
 

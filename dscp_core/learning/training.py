@@ -16,12 +16,12 @@ from dscp_core.errors import InvalidInputError
 from dscp_core.learning.checkpoint import CHECKPOINT_FILE, CheckpointError
 from dscp_core.learning.descent import descend
 from dscp_core.learning.evaluator import DescentModel
-from dscp_core.learning.parallel import ProcessEngine
 from dscp_core.learning.recipes import Recipe
 from dscp_core.learning.refinement import refine
 from dscp_core.learning.run import Errors, Run, stage
 from dscp_core.learning.sampling import PAPER_BOX
 from dscp_core.learning.supervised import supervise
+from dscp_core.parallel import ProcessEngine
 from dscp_core.parameters import Value
 from dscp_core.problems import powered_descent
 from dscp_core.terminal_time import FeatureMap, TerminalTimeNetwork, replace_file, vehicle_of

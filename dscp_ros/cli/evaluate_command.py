@@ -128,8 +128,8 @@ def run_terminal_time(args: argparse.Namespace) -> int:
     from dscp_core import problems
     from dscp_core.learning import evaluation
     from dscp_core.learning.evaluator import DescentModel
-    from dscp_core.learning.parallel import ProcessEngine
     from dscp_core.learning.sampling import PAPER_BOX, horizontal_profile, vertical_profile
+    from dscp_core.parallel import ProcessEngine
     from dscp_core.problems import powered_descent
     from dscp_core.terminal_time import DEFAULT_NETWORK, FeatureMap, TerminalTimeNetwork
 

@@ -14,8 +14,8 @@ from dscp_core.learning.evaluation import (
 )
 from dscp_core.learning.evaluator import DescentEvaluator, DescentModel
 from dscp_core.learning.figures import profile_figure, training_figure
-from dscp_core.learning.parallel import SerialEngine
 from dscp_core.learning.sampling import PAPER_BOX, horizontal_profile
+from dscp_core.parallel import SerialEngine
 
 MODEL = DescentModel({"mean_thrust_fraction": 1.0}, intervals=20)
 STATES = PAPER_BOX.uniform(5, np.random.default_rng(6))

@@ -14,8 +14,8 @@ from dscp_core.learning.evaluator import (
     GradientMethod,
 )
 from dscp_core.learning.labels import LabelError, best_times, given_times
-from dscp_core.learning.parallel import SerialEngine
 from dscp_core.learning.sampling import PAPER_BOX
+from dscp_core.parallel import SerialEngine
 from dscp_core.scp import ScpOptions
 
 PAPER_STATE = np.array([[5000.0, 500.0, 500.0, -150.0, 30.0, -30.0, 38000.0]])

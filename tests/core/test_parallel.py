@@ -13,7 +13,7 @@ import pytest
 from learning_support import KillsItsWorker, numeric_threads, square
 
 from dscp_core.errors import InvalidInputError
-from dscp_core.learning.parallel import (
+from dscp_core.parallel import (
     ProcessEngine,
     SerialEngine,
     WorkerLostError,
@@ -91,7 +91,7 @@ def test_workers_end_with_their_parent() -> None:
         "import sys, time\n"
         f"sys.path[:0] = {sys.path!r}\n"
         "from learning_support import square\n"
-        "from dscp_core.learning.parallel import ProcessEngine\n"
+        "from dscp_core.parallel import ProcessEngine\n"
         "if __name__ == '__main__':\n"
         "    engine = ProcessEngine(square, 2)\n"
         "    list(engine.map([1.0, 2.0]))\n"
