@@ -1,7 +1,7 @@
-"""Evaluating many independent items: in this process, or in worker processes.
+"""Evaluating many independent items: in this process, in worker processes, or on a Ray cluster.
 
-Results come in the order of the items and do not depend on how many workers there are, as long as
-an item's result depends on nothing but the item.
+Results come in the order of the items and do not depend on how many workers there are, nor on
+which of them die, as long as an item's result depends on nothing but the item.
 """
 
 # No numeric library is imported here: a worker reads this module before its threads are limited.
@@ -18,6 +18,7 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import dataclass
 from multiprocessing import connection
+from multiprocessing.context import SpawnContext, SpawnProcess
 from typing import Any, Generic, Protocol, TypeVar
 
 from dscp_core.errors import DscpError, InvalidInputError
@@ -27,18 +28,21 @@ Result = TypeVar("Result")
 ItemIn = TypeVar("ItemIn", contravariant=True)
 ResultOut = TypeVar("ResultOut", covariant=True)
 
-_THREAD_VARIABLES = (
-    "OMP_NUM_THREADS",
-    "OPENBLAS_NUM_THREADS",
-    "MKL_NUM_THREADS",
-    "RAYON_NUM_THREADS",
+ONE_NUMERIC_THREAD = dict.fromkeys(
+    ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "RAYON_NUM_THREADS"), "1"
 )
+"""Environment of a worker: more threads than cores cost time, and sum in another order."""
+
 _IN_FLIGHT_PER_WORKER = 3
 _MAX_LOSSES = 3
 
 
 class WorkerLostError(DscpError):
     """Workers keep dying on the same items."""
+
+
+class RayMissingError(DscpError):
+    """A Ray cluster is asked for, and Ray is not installed."""
 
 
 class Engine(Protocol[ItemIn, ResultOut]):
@@ -180,18 +184,58 @@ class ProcessEngine(Generic[Item, Result]):
         self._pool = self._start()
 
     def _start(self) -> ProcessPoolExecutor:
-        pool = ProcessPoolExecutor(
+        return ProcessPoolExecutor(
             self._workers,
-            mp_context=multiprocessing.get_context("spawn"),
+            mp_context=_Context(),
             initializer=_initialise,
             initargs=(self._setup,),
         )
-        # The numeric libraries of a worker read the environment that it is started with, and
-        # workers are started as items come in.
-        with _environment(dict.fromkeys(_THREAD_VARIABLES, "1")):
-            for _ in range(self._workers):
-                pool.submit(os.getpid)
-        return pool
+
+
+class _WorkerProcess(SpawnProcess):
+    """The numeric libraries of a process read the environment that it is started with."""
+
+    def start(self) -> None:
+        """Start with one numeric thread."""
+        with _environment(ONE_NUMERIC_THREAD):
+            super().start()
+
+
+class _Context(SpawnContext):
+    Process = _WorkerProcess
+
+
+def make_engine(
+    setup: Callable[[], Callable[[Item], Result]],
+    workers: int | None = None,
+    ray_address: str | None = None,
+) -> Engine[Item, Result]:
+    """An engine of worker processes, or of a Ray cluster where an address is given.
+
+    One worker is a process too: this process may have more numeric threads, which sum in another
+    order, and results must not depend on the number of workers.
+
+    Args:
+        setup: Makes the function that evaluates an item, in each worker; picklable, as are items
+            and results.
+        workers: How many; None for one per processor, of this machine or of the cluster.
+        ray_address: HOST:PORT of the cluster's head, or "auto" for the one that this machine
+            belongs to.
+
+    Raises:
+        InvalidInputError: Fewer than one worker, or no address of a cluster.
+        RayMissingError: An address is given, and Ray is not installed.
+        RayClusterError: There is no usable cluster at the address.
+    """
+    if ray_address is None:
+        return ProcessEngine(setup, available_cores() if workers is None else workers)
+    try:
+        from dscp_core.ray_engine import RayEngine
+    except ModuleNotFoundError as error:
+        if error.name != "ray":
+            raise
+        raise RayMissingError("a cluster needs Ray: pip install 'dscp[ray]'") from None
+    return RayEngine(setup, workers, ray_address)
 
 
 def available_cores() -> int:
@@ -199,15 +243,16 @@ def available_cores() -> int:
     return len(os.sched_getaffinity(0))
 
 
+_setup: Callable[[], Callable[[Any], Any]] | None = None
 _function: Callable[[Any], Any] | None = None
 
 
 def _initialise(setup: Callable[[], Callable[[Any], Any]]) -> None:
-    global _function
+    global _setup
     # Ctrl-C reaches the whole process group; the parent decides what to do about it.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    _function = setup()
+    _setup = setup
 
 
 def _end_with_parent() -> None:
@@ -219,8 +264,12 @@ def _end_with_parent() -> None:
 
 
 def _evaluate(item: Any) -> Any:
+    global _function
     if _function is None:
-        raise RuntimeError("worker without a function")
+        if _setup is None:
+            raise RuntimeError("worker without a setup")
+        # Here and not in the initialiser: its errors only say that the pool is broken.
+        _function = _setup()
     return _function(item)
 
 

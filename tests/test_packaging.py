@@ -149,7 +149,7 @@ def test_wheel_holds_code_data_and_license(source: Path, tmp_path: Path) -> None
     code = {
         str(path.relative_to(ROOT))
         for package in PACKAGES
-        for pattern in ("*.py", "py.typed", "*.yaml")
+        for pattern in ("*.py", "py.typed", "*.yaml", "*.safetensors")
         for path in (ROOT / package).rglob(pattern)
     }
     data = {f"{stem}.data/data/share/dscp_ros/{path}" for path in shared_files()}

@@ -10,7 +10,7 @@ import time
 from pathlib import Path
 
 import pytest
-from learning_support import KillsItsWorker, numeric_threads, square
+from learning_support import FailsToStart, KillsItsWorker, numeric_threads, square
 
 from dscp_core.errors import InvalidInputError
 from dscp_core.parallel import (
@@ -18,6 +18,7 @@ from dscp_core.parallel import (
     SerialEngine,
     WorkerLostError,
     available_cores,
+    make_engine,
 )
 
 
@@ -46,6 +47,25 @@ def test_one_numeric_thread_per_worker(monkeypatch: pytest.MonkeyPatch) -> None:
         engine.close()
     assert os.environ["OMP_NUM_THREADS"] == "4"
     assert "OPENBLAS_NUM_THREADS" not in os.environ
+
+
+def test_a_setup_that_fails_says_why(tmp_path: Path) -> None:
+    engine = ProcessEngine(FailsToStart(), 1)
+    try:
+        with pytest.raises(InvalidInputError, match="formulation"):
+            list(engine.map([1]))
+    finally:
+        engine.close()
+
+
+def test_an_engine_for_this_machine_has_a_worker_per_processor() -> None:
+    for given, expected in ((None, available_cores()), (1, 1)):
+        engine = make_engine(square, given)
+        try:
+            assert isinstance(engine, ProcessEngine), "one worker is a process too"
+            assert engine.workers == expected
+        finally:
+            engine.close()
 
 
 def test_a_dead_worker_is_replaced(tmp_path: Path) -> None:
