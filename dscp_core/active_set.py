@@ -154,6 +154,7 @@ def constraint_scales(
     values: ConeValues,
     products: Products,
     z: FloatArray,
+    equality_dual: FloatArray,
     cone_dual: FloatArray,
 ) -> ConstraintScales:
     """Natural sizes at a point.
@@ -164,13 +165,19 @@ def constraint_scales(
         values: Data of the program.
         products: At z and the duals.
         z: (n,) primal point.
+        equality_dual: (p,) nu.
         cone_dual: (m,) y.
     """
-    g_rows, g_columns = pattern.g.indices, pattern.g.columns
-    cone_force = np.bincount(g_columns, values.g * cone_dual[g_rows], minlength=pattern.n)
+    g_columns = pattern.g.columns
     # Terms one by one: what cancels in their sum still limits how small a multiplier can be told.
+    # A state without a cost feels its dynamics alone, which cancel where no limit is active.
     force = np.abs(products.q_z) + np.abs(values.c)
-    force += np.abs(products.k_duals - cone_force) + np.abs(cone_force)
+    for matrix, entries, dual in (
+        (pattern.a, values.a, equality_dual),
+        (pattern.g, values.g, cone_dual),
+    ):
+        terms = np.abs(entries * dual[matrix.indices])
+        force += np.bincount(matrix.columns, terms, minlength=pattern.n)
     largest = float(force.max()) or 1.0
     force += 1e-10 * largest  # where nothing acts, any multiplier is large
     size = np.abs(values.g)

@@ -125,8 +125,7 @@ class InteriorPhase:
         n, p = self._pattern.n, self._pattern.n_equalities
         diagonal = np.zeros(self._rows.n_rows)
         diagonal[pairs.rows] = -pairs.slack / pairs.dual
-        self._matrix.assemble(values, point.active, point.frame, point.eta, diagonal)
-        self._matrix.factor()
+        self._matrix.update(values, point.active, point.frame, point.eta, diagonal)
         step, d_slack, d_dual, length = self._direction(point, pairs, 0.0)
         if length < 0.9:
             tau = (1.0 - length) ** 3 * float(pairs.slack @ pairs.dual) / pairs.slack.size

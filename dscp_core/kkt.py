@@ -90,6 +90,7 @@ class KktMatrix:
         self._regularisation[:n] = regularisation
         self._strength = regularisation
         self._values = np.zeros(self._factored.nnz)
+        self._held: tuple[ConeValues, bytes] | None = None
         # Random signs, so that no direction of the solution space is missed systematically.
         self._probe_vector = np.random.default_rng(0).choice((-1.0, 1.0), self.size)
 
@@ -121,7 +122,7 @@ class KktMatrix:
         self._factored.data = sample
         self._factor = qdldl.Solver(self._factored, upper=True)
 
-    def assemble(
+    def update(
         self,
         values: ConeValues,
         active: ActiveSet,
@@ -129,15 +130,38 @@ class KktMatrix:
         eta: FloatArray,
         slot_diagonal: FloatArray | None = None,
     ) -> None:
-        """Set the matrix of one point.
+        """Assemble and factor the matrix of one point.
+
+        Without second-order cones it depends on data and active set alone, and nothing is done
+        when both are those of the last call.
 
         Args:
-            values: Data of the program.
+            values: Data of the program, not changed in place between calls.
             active: Which rows are coupled.
             frame: Geometry of the slack.
             eta: (m,) multipliers.
             slot_diagonal: (m,) added to the diagonal of the rows of eta, zero if None.
         """
+        key = active.key()
+        depends_on_point = slot_diagonal is not None or bool(self._rows.starts.size)
+        held = self._held
+        if not depends_on_point and held is not None and held[0] is values and held[1] == key:
+            return
+        self._held = None
+        self._assemble(values, active, frame, eta, slot_diagonal)
+        self._refactor()
+        if not depends_on_point:
+            self._held = (values, key)
+
+    def _assemble(
+        self,
+        values: ConeValues,
+        active: ActiveSet,
+        frame: ConeFrame,
+        eta: FloatArray,
+        slot_diagonal: FloatArray | None = None,
+    ) -> None:
+        """Set the values of the matrix of one point."""
         rows = self._rows
         # Weight of each row of G in the normal of its constraint: (1, -u) on a cone's boundary.
         weight = np.zeros(rows.n_rows)
@@ -171,7 +195,7 @@ class KktMatrix:
         self._values = self._gather @ sources
         self._full.data = self._values[self._full_cells]
 
-    def factor(self) -> None:
+    def _refactor(self) -> None:
         """Factor the assembled matrix, regularised."""
         regularised = self._values.copy()
         regularised[self._diagonal_cells] += self._regularisation

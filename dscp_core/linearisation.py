@@ -69,8 +69,7 @@ class KktWorkspace:
         if self._owner is point:
             return
         self.bind(values)
-        self.matrix.assemble(values, point.active, point.frame, point.eta)
-        self.matrix.factor()
+        self.matrix.update(values, point.active, point.frame, point.eta)
         self._owner = point
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
+from pathlib import Path
 from typing import Any
 
 import casadi as ca
@@ -12,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dscp_core.errors import InvalidInputError
-from dscp_core.parameters import Parameter, ParameterTable, Value
+from dscp_core.parameters import Parameter, ParameterTable, Value, load_parameter_file
 
 TERMINAL_TIME = "terminal_time"
 VIRTUAL_CONTROL_WEIGHT = "virtual_control_weight"
@@ -167,7 +168,12 @@ class OptimalControlProblem:
         running_cost: Lagrange term Theta(x, u, p) of the true cost, summed as
             ``T * sum over nodes``, or None; what a subproblem minimises of it stands in
             ``cost_terms``.
+        cost_unit: Unit of the cost; "1" for a pure number.
         cost_scale: Cost of one scaled unit.
+        cost_magnitude: Cost below which its changes are judged in units of this instead of
+            relative to it; None for `cost_scale`.
+        cost_tolerance: Default bound on the relative change of the cost at convergence.
+        defect_tolerance: Default bound on the defects there, relative to the states' scales.
         cost_terms: Further subproblem costs (curvature, prox, quadratic running cost).
         path_constraints: Linearised constraints.
         cone_constraints: Second-order cones.
@@ -179,10 +185,16 @@ class OptimalControlProblem:
         trust_region_state: Default weights per state, scaled cost per scaled square.
         trust_region_control: Default weights per control, likewise.
         trust_region_step: Default weight on the interval length T, per (T_ref)^2 relative square.
+        trust_region_per_second: Multiply the weights of states and controls by the reference's T,
+            so that their sum over the nodes approximates an integral, whatever N.
+        default_intervals: Number N of intervals that suits the problem.
         initial_guess: Builds the first reference for N intervals, as CasADi MX of the parameters.
+        free_terminal_time: Whether the terminal time is a decision unless asked otherwise.
         terminal_time_bounds: Least and greatest terminal time when it is free, or None.
         initial_state_parameters: Names of the parameters that hold the initial state; their
             values, one after the other, are the states in order.
+        vehicle_tables: What a vehicle file may name besides parameters: name to a function that
+            reads the file it points to and returns parameter values.
         check_parameters: Raises `InvalidInputError` for values by name that contradict each other.
         check_state: Raises `InvalidInputError` for an initial state that no plan can start from;
             arguments are the states (nx,) and the parameters' values by name.
@@ -204,8 +216,14 @@ class OptimalControlProblem:
     terminal_cost: Callable[[ca.SX, ca.SX, Parameters], ca.SX]
     cost_scale: float
     initial_guess: Callable[[Mapping[str, ca.MX], int], InitialGuess]
+    default_intervals: int = 50
+    free_terminal_time: bool = False
     terminal_time_bounds: Callable[[Parameters], tuple[ca.SX, ca.SX]] | None = None
     running_cost: Callable[[ca.SX, ca.SX, Parameters], ca.SX] | None = None
+    cost_unit: str = "1"
+    cost_magnitude: float | None = None
+    cost_tolerance: float = 1e-8
+    defect_tolerance: float = 1e-6
     cost_terms: tuple[CostTerm, ...] = ()
     path_constraints: tuple[PathConstraint, ...] = ()
     cone_constraints: tuple[ConeConstraint, ...] = ()
@@ -215,7 +233,11 @@ class OptimalControlProblem:
     trust_region_state: tuple[float, ...] = ()
     trust_region_control: tuple[float, ...] = ()
     trust_region_step: float = 0.0
+    trust_region_per_second: bool = False
     initial_state_parameters: tuple[str, ...] = ()
+    vehicle_tables: Mapping[str, Callable[[Path], Mapping[str, Value]]] = field(
+        default_factory=dict
+    )
     check_parameters: Callable[[Mapping[str, Any]], None] | None = None
     check_state: Callable[[NDArray[np.float64], Mapping[str, Any]], None] | None = None
     terminal_time_guess: Callable[[NDArray[np.float64], Mapping[str, Any]], float] | None = None
@@ -253,21 +275,42 @@ class OptimalControlProblem:
             self.check_parameters(self.table.unpack(packed))
         return packed
 
+    def read_vehicle(self, path: str | Path) -> dict[str, Value]:
+        """Values of a vehicle file, those of the tables that it points to included.
+
+        Raises:
+            InvalidInputError: The file or a table cannot be used, or both give a value.
+        """
+        values: dict[str, Any] = dict(load_parameter_file(path))
+        for name, read in self.vehicle_tables.items():
+            if name not in values:
+                continue
+            table = values.pop(name)
+            if not isinstance(table, str):
+                raise InvalidInputError(name, table, "the name of a file beside the vehicle's")
+            found = read(Path(path).parent / table)
+            twice = sorted(set(found) & set(values))
+            if twice:
+                raise InvalidInputError(name, table, f"no {', '.join(twice)} beside it")
+            values.update(found)
+        return values
+
     def _scp_parameters(self) -> Sequence[Parameter]:
         """Parameters of the algorithm (theta_SCP), appended to those of the problem."""
         nx, nu = len(self.states), len(self.controls)
+        unit = "1/s" if self.trust_region_per_second else "1"
         parameters = [
             Parameter(
                 TRUST_REGION_STATE,
                 self.trust_region_state or (0.0,) * nx,
-                "1",
+                unit,
                 "Trust-region penalty per state, scaled cost per squared scaled state.",
                 lower=0.0,
             ),
             Parameter(
                 TRUST_REGION_CONTROL,
                 self.trust_region_control or (0.0,) * nu,
-                "1",
+                unit,
                 "Trust-region penalty per control, scaled cost per squared scaled control.",
                 lower=0.0,
             ),

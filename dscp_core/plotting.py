@@ -29,19 +29,23 @@ def plan_figure(
     parameters: Mapping[str, Any],
     title: str | None = None,
 ) -> Figure:
-    """A powered descent as planned, and as it went when the plan was flown.
+    """A plan as it was made, and as it went when it was flown.
 
     Args:
         plan: The plan.
         certificate: Its certificate, with the flight.
         parameters: Vehicle and mission by name, SI, as `ParameterTable.unpack` gives them.
-        title: Headline; by default verdict, terminal time, mass and miss.
+        title: Headline; by default verdict, terminal time, miss and what else counts.
 
     Raises:
         InvalidInputError: A plan of another problem.
     """
+    if plan.problem == "entry":
+        from dscp_core.problems.entry.figure import entry_figure
+
+        return entry_figure(plan, certificate, parameters, title)
     if plan.problem != "powered_descent":
-        raise InvalidInputError("problem", plan.problem, "powered_descent")
+        raise InvalidInputError("problem", plan.problem, "powered_descent or entry")
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(13.5, 8.0), dpi=120, layout="constrained")
@@ -52,27 +56,27 @@ def plan_figure(
     _draw_descent(figure.add_subplot(grid[0, 1]), plan, certificate, parameters)
 
     speed = figure.add_subplot(grid[0, 2])
-    _draw_history(
+    draw_history(
         speed, plan, certificate, _speed(plan.states), _speed(certificate.states), "speed [m/s]"
     )
     thrust = figure.add_subplot(grid[1, 0])
     planned, flown = (
         np.linalg.norm(c, axis=1) / 1e3 for c in (plan.controls, certificate.controls)
     )
-    _draw_history(thrust, plan, certificate, planned, flown, "thrust [kN]", stepped=True)
-    _draw_limit(thrust, parameters["thrust_min"] / 1e3, "least thrust", above=False)
-    _draw_limit(thrust, parameters["thrust_max"] / 1e3, "greatest thrust", above=True)
+    draw_history(thrust, plan, certificate, planned, flown, "thrust [kN]", stepped=True)
+    draw_limit(thrust, parameters["thrust_min"] / 1e3, "least thrust", above=False)
+    draw_limit(thrust, parameters["thrust_max"] / 1e3, "greatest thrust", above=True)
 
     mass = figure.add_subplot(grid[1, 1])
     planned, flown = (states[:, 6] / 1e3 for states in (plan.states, certificate.states))
-    _draw_history(mass, plan, certificate, planned, flown, "mass [t]")
+    draw_history(mass, plan, certificate, planned, flown, "mass [t]")
     pointing = figure.add_subplot(grid[1, 2])
     planned, flown = _tilt(plan.controls), _tilt(certificate.controls)
-    _draw_history(
+    draw_history(
         pointing, plan, certificate, planned, flown, "thrust off vertical [deg]", stepped=True
     )
     limit = float(np.degrees(parameters["pointing_angle_max"]))
-    _draw_limit(pointing, limit, "pointing limit", above=True)
+    draw_limit(pointing, limit, "pointing limit", above=True)
     pointing.set_ylim(bottom=0.0)
     handles, labels = mass.get_legend_handles_labels()
     figure.legend(handles, labels, loc="upper right", ncols=2, frameon=False)
@@ -94,7 +98,7 @@ def _headline(plan: Plan, certificate: PlanCertificate) -> str:
     return text if missed is None else f"{text}, miss {missed:.2f} m"
 
 
-def _draw_history(
+def draw_history(
     axes: Axes,
     plan: Plan,
     certificate: PlanCertificate,
@@ -104,6 +108,7 @@ def _draw_history(
     *,
     stepped: bool = False,
 ) -> None:
+    """A panel of one quantity over time: planned at the nodes, and as flown."""
     style = "steps-post" if stepped else "default"
     axes.plot(
         certificate.times_s, flown, color=FLOWN, linewidth=1.6, drawstyle=style, label="integrated"
@@ -115,7 +120,9 @@ def _draw_history(
     draw_panel_style(axes)
 
 
-def _draw_limit(axes: Axes, value: float, name: str, *, above: bool) -> None:
+def draw_limit(axes: Axes, value: float, name: str, *, above: bool) -> None:
+    """A limit as a named line; the axes grow to show it."""
+    """A limit across a panel, named above or below its line."""
     axes.axhline(value, color=LIMIT, linestyle="--", linewidth=1.1)
     axes.annotate(
         name,

@@ -162,8 +162,7 @@ class Polisher:
             return PolishResult(point, "", 0, 0)
         while steps < options.max_steps and (steps == 0 or size > options.tolerance):
             if not factored:
-                self._matrix.assemble(values, point.active, point.frame, point.eta)
-                self._matrix.factor()
+                self._matrix.update(values, point.active, point.frame, point.eta)
             step, _ = self._matrix.solve(-point.defect, _STEP_ACCURACY)
             steps += 1
             before, point = size, self._moved(values, point, step)

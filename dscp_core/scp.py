@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import dataclass, field, replace
+from enum import Enum
 from typing import Any
 
 import numpy as np
@@ -16,7 +18,15 @@ from dscp_core.solvers import SolverSettings, make_solver
 from dscp_core.trace import Iteration, ScpResult, ScpStatus
 from dscp_core.transcription import Evaluation, Transcription
 
-__all__ = ["Iteration", "Scp", "ScpOptions", "ScpResult", "ScpStatus", "objective"]
+__all__ = [
+    "Iteration",
+    "Scp",
+    "ScpOptions",
+    "ScpResult",
+    "ScpStatus",
+    "StoppingRule",
+    "objective",
+]
 
 Array = NDArray[np.float64]
 
@@ -30,6 +40,18 @@ _SETTLED_CHANGE = 1e-3
 _SETTLED_DEFECT = 0.05  # of the virtual control
 
 
+class StoppingRule(Enum):
+    """When the iterations have converged.
+
+    GUARDED: the change of the cost, the change that the subproblem predicted, and the defects are
+    all small. COST_CHANGE: the paper's rule for reproduction, the change of the true cost alone,
+    which may be small for one iteration on the way, at a trajectory that cannot be flown.
+    """
+
+    GUARDED = "guarded"
+    COST_CHANGE = "cost_change"
+
+
 @dataclass(frozen=True)
 class ScpOptions:
     """How to iterate.
@@ -37,9 +59,11 @@ class ScpOptions:
     Attributes:
         max_iterations: Iteration limit.
         fixed_iterations: Run exactly this many iterations without testing, or None.
+        stopping: Which tests end the iterations.
         cost_tolerance: Bound on the relative change of the penalised cost (eq. for epsilon_J) and
-            on the change that the subproblem predicted.
-        defect_tolerance: Bound on the defects, relative to the states' scales.
+            on the change that the subproblem predicted, or None for the problem's own.
+        defect_tolerance: Bound on the defects, relative to the states' scales, or None for the
+            problem's own.
         virtual_control_tolerance: Bound on the virtual control, relative to the states' scales, or
             None for the problem's own.
         polish: Refine each subproblem's solution on its active set, for differentiation.
@@ -50,8 +74,9 @@ class ScpOptions:
 
     max_iterations: int = 20
     fixed_iterations: int | None = None
-    cost_tolerance: float = 1e-8
-    defect_tolerance: float = 1e-6
+    stopping: StoppingRule = StoppingRule.GUARDED
+    cost_tolerance: float | None = None
+    defect_tolerance: float | None = None
     virtual_control_tolerance: float | None = None
     polish: bool = False
     deadline_s: float | None = None
@@ -95,6 +120,18 @@ class Scp:
         self._solver = make_solver(
             self.options.solver, transcription.pattern, self.options.solver_settings
         )
+
+    @property
+    def cost_tolerance(self) -> float:
+        """Bound on the relative change of the cost: of the options, or else of the problem."""
+        given = self.options.cost_tolerance
+        return self.transcription.problem.cost_tolerance if given is None else given
+
+    @property
+    def defect_tolerance(self) -> float:
+        """Bound on the defects: of the options, or else of the problem."""
+        given = self.options.defect_tolerance
+        return self.transcription.problem.defect_tolerance if given is None else given
 
     @property
     def virtual_control_tolerance(self) -> float:
@@ -155,12 +192,15 @@ class _Run:
                 "initial_reference", f"shape {self._initial.shape}", f"shape ({expected},)"
             )
         if not np.all(np.isfinite(self._initial)):
-            raise InvalidInputError("initial_reference", "NaN or Inf", "finite")
+            what = "initial_reference" if self._warm else "the problem's initial guess"
+            raise InvalidInputError(what, "NaN or Inf", "finite")
         self._iterations: list[Iteration] = []
+        self._first_cost = math.nan
 
     def execute(self) -> ScpResult:
         reference = self._initial
         evaluation = self._transcription.evaluate(reference, self._parameters)
+        self._first_cost = evaluation.cost
         for _ in range(self._options.iteration_limit):
             remaining = self._remaining()
             if remaining is not None and remaining <= 0.0:
@@ -230,17 +270,28 @@ class _Run:
 
     def _stationary(self) -> bool:
         """Whether the last iteration changed nothing that matters, feasible or not."""
-        options, last = self._options, self._iterations[-1]
+        if self._options.stopping is StoppingRule.COST_CHANGE:
+            return self._cost_stands_still()
+        last, tolerance = self._iterations[-1], self._scp.cost_tolerance
         if len(self._iterations) < 2 and not self._warm:
             return False
-        scale = max(1.0, abs(last.penalised_cost))
-        if abs(last.predicted_change) > options.cost_tolerance * scale:
+        problem = self._transcription.problem
+        least = (problem.cost_magnitude or problem.cost_scale) / problem.cost_scale
+        scale = max(least, abs(last.penalised_cost))
+        if abs(last.predicted_change) > tolerance * scale:
             return False
         if len(self._iterations) > 1:
             change = last.penalised_cost - self._iterations[-2].penalised_cost
-            if abs(change) > options.cost_tolerance * scale:
+            if abs(change) > tolerance * scale:
                 return False
-        return self._relative(last.defects - last.virtual_control) <= options.defect_tolerance
+        residual = self._relative(last.defects - last.virtual_control)
+        return residual <= self._scp.defect_tolerance
+
+    def _cost_stands_still(self) -> bool:
+        """The paper's rule: relative change of the true cost from reference to solution."""
+        iterations = self._iterations
+        before = iterations[-2].cost if len(iterations) > 1 else self._first_cost
+        return abs(iterations[-1].cost - before) < self._scp.cost_tolerance * abs(before)
 
     def _virtual_control_settled(self) -> bool:
         """Whether the virtual control has stopped at a size that is no rounding.
@@ -302,7 +353,9 @@ class _Run:
         values.c[:] = 0.0
         least = self._scp.solve(values, self._remaining())
         if least.status is SolveStatus.INFEASIBLE:
-            return ScpStatus.SUBPROBLEM_INFEASIBLE, "infeasible even with free virtual control"
+            if layout.virtual_states.size:
+                return ScpStatus.SUBPROBLEM_INFEASIBLE, "infeasible even with free virtual control"
+            return ScpStatus.SUBPROBLEM_INFEASIBLE, "infeasible whatever the cost"
         if least.status is SolveStatus.SOLVED:
             size = self._relative(layout.virtual_control(least.z))
             if size > self._virtual_tolerance:

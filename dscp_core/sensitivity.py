@@ -18,7 +18,7 @@ from dscp_core.verdict import TrustLimits, judge, margins
 __all__ = ["KktSystem", "Linearisation", "SensitivityOptions"]
 
 # A polished point is kept although the solver claims a smaller residual when both are at the
-# level of rounding.
+# level of rounding. Its gap follows from the other two, times the sizes of z and the duals.
 _ROUNDING_RESIDUAL = 1e-12
 
 
@@ -117,7 +117,7 @@ class KktSystem:
         self._workspace.bind(values)
         z, nu, y = solution.z, solution.equality_dual, solution.cone_dual
         products = self._workspace.matrices.products(z, np.concatenate((nu, y)))
-        scales = constraint_scales(self.pattern, self._rows, values, products, z, y)
+        scales = constraint_scales(self.pattern, self._rows, values, products, z, nu, y)
         active = identify(self._rows, scales, solution.slack, y)
         start = self._evaluator.point(values, active, z, nu, y, products)
         outcome = _Outcome(start)
@@ -169,7 +169,8 @@ class KktSystem:
         if not problem:
             residual = self._evaluator.residuals(values, result.point)
             claimed = max(solution.primal_residual, solution.dual_residual, solution.gap)
-            if residual.worst <= max(claimed, _ROUNDING_RESIDUAL):
+            rounding = max(residual.primal, residual.dual) <= _ROUNDING_RESIDUAL
+            if rounding or residual.worst <= claimed:
                 outcome.point, outcome.residual = result.point, residual
                 return
             problem = f"residual {residual.worst:.1e} above the solver's {claimed:.1e}"

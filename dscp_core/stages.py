@@ -258,7 +258,10 @@ def _node_stage(
     weights = ca.vertcat(
         symbols.parameters[TRUST_REGION_STATE], symbols.parameters[TRUST_REGION_CONTROL]
     )
-    _add_quadratic(collect, "trust_region", ca.dot(weights, change**2), symbols)
+    penalty = ca.dot(weights, change**2)
+    if problem.trust_region_per_second:
+        penalty *= symbols.nodes(symbols.reference)[0].step
+    _add_quadratic(collect, "trust_region", penalty, symbols)
     return collect.stage("node", symbols.reference, symbols.packed)
 
 

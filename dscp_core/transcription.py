@@ -48,7 +48,11 @@ class Transcription:
     """
 
     def __init__(
-        self, problem: OptimalControlProblem, intervals: int, *, free_terminal_time: bool = False
+        self,
+        problem: OptimalControlProblem,
+        intervals: int,
+        *,
+        free_terminal_time: bool | None = None,
     ) -> None:
         """Compile the problem's functions.
 
@@ -56,7 +60,7 @@ class Transcription:
             problem: The declaration.
             intervals: Number N of intervals.
             free_terminal_time: Make the terminal time a decision; the parameter
-                ``terminal_time`` is then its first guess only.
+                ``terminal_time`` is then its first guess only. None for the problem's default.
 
         Raises:
             InvalidInputError: ``intervals`` below 2.
@@ -71,7 +75,9 @@ class Transcription:
             control_scale=np.array([c.scale for c in problem.controls]),
             time_scale=time_scale,
             intervals=intervals,
-            free_terminal_time=free_terminal_time,
+            free_terminal_time=(
+                problem.free_terminal_time if free_terminal_time is None else free_terminal_time
+            ),
             virtual_scale=np.array(problem.virtual_control_scale or (0.0,) * len(problem.states)),
         )
         stages = build_stages(problem, self.layout)

@@ -6,15 +6,17 @@ from collections.abc import Callable
 
 from dscp_core.errors import InvalidInputError
 from dscp_core.ocp import OptimalControlProblem
-from dscp_core.problems import powered_descent
+from dscp_core.problems import entry, powered_descent
 
 _PROBLEMS: dict[str, Callable[[str], OptimalControlProblem]] = {
     powered_descent.NAME: lambda formulation: powered_descent.powered_descent(
         powered_descent.Formulation(formulation)
     ),
+    entry.NAME: lambda formulation: entry.entry(entry.Formulation(formulation)),
 }
 _FORMULATIONS: dict[str, tuple[str, ...]] = {
     powered_descent.NAME: tuple(f.value for f in reversed(powered_descent.Formulation)),
+    entry.NAME: tuple(f.value for f in reversed(entry.Formulation)),
 }
 
 

@@ -89,7 +89,14 @@ class RunDifferences:
         self._loss = loss
         self._size = abs(loss.value(scp.transcription, trace))
 
-    def derivative(self, name: str, component: int = 0, *, step: float | None = None) -> Difference:
+    def derivative(
+        self,
+        name: str,
+        component: int = 0,
+        *,
+        step: float | None = None,
+        most_steps: int = _MOST_STEPS,
+    ) -> Difference:
         """Derivative with respect to one component of a parameter.
 
         The first step stays within the active set where rounding allows, and steps shrink until
@@ -99,6 +106,8 @@ class RunDifferences:
             name: Name of the parameter.
             component: Index into a vector parameter.
             step: Longest step, SI; None for one that suits the parameter.
+            most_steps: Most steps, at least 2; with 2 there is one extrapolation, and its
+                uncertainty is what it changed.
 
         Raises:
             InvalidInputError: Unknown name, or a step that is not positive or leaves the
@@ -125,16 +134,18 @@ class RunDifferences:
         # Central, unless a kink is so close that one side reaches further; steps shrink anyway.
         inside = [(k, h, radius) for k, h, radius in usable if h * _REACH[k] <= radius]
         widest = max(usable, key=lambda choice: choice[2] / (choice[1] * _REACH[choice[0]]))
-        return self._shrink(direction, *(inside[0] if inside else widest))
+        return self._shrink(direction, most_steps, *(inside[0] if inside else widest))
 
     def _radius(self, direction: Array) -> float:
         return tangent(self._scp, self._trace, direction).active_set_radius
 
-    def _shrink(self, direction: Array, kind: str, first: float, radius: float) -> Difference:
+    def _shrink(
+        self, direction: Array, most_steps: int, kind: str, first: float, radius: float
+    ) -> Difference:
         slopes: list[tuple[float, float]] = []
         older: _Extrapolation | None = None
         best, doubt, rejected = None, np.inf, 0
-        for number in range(_MOST_STEPS):
+        for number in range(most_steps):
             h = first / _SHRINKING**number
             slope = self._slope(direction, h, kind)
             if slope is None:
@@ -151,6 +162,8 @@ class RunDifferences:
                 if doubt <= max(_SATISFIED * abs(older.value), older.rounding):
                     break
             older = newer
+        if best is None and older is not None:
+            best, doubt = older, max(abs(older.value - slopes[-1][1]), older.rounding)
         if best is None:
             return Difference(None, np.inf, first, kind, radius, rejected)
         return Difference(best.value, float(doubt), best.step, kind, radius, rejected)

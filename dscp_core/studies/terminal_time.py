@@ -2,13 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
-import multiprocessing
-import os
-import signal
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from statistics import fmean, median
@@ -19,6 +14,7 @@ from dscp_core import dscp, problems
 from dscp_core.errors import InvalidInputError
 from dscp_core.losses import FinalStateLoss
 from dscp_core.ocp import TERMINAL_TIME
+from dscp_core.parallel import make_engine
 from dscp_core.plan import PlanStatus
 from dscp_core.planner import Planner, PlannerSettings, TerminalTime
 from dscp_core.scp import ScpOptions, ScpStatus
@@ -32,8 +28,6 @@ GROSS_ERROR = 1e-3
 """A gradient with a relative error beyond this is of no use."""
 
 _MOST_POINTS = 10_000
-_POINTS_PER_TASK = 4
-_THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 _LOSS = FinalStateLoss("mass")
 
 
@@ -164,48 +158,35 @@ class SweepSummary:
 
 
 def run_sweep(
-    sweep: Sweep, *, jobs: int = 1, report: Callable[[int], object] = lambda _: None
+    sweep: Sweep,
+    *,
+    jobs: int | None = 1,
+    ray_address: str | None = None,
+    report: Callable[[int], object] = lambda _: None,
 ) -> list[SweepPoint]:
     """All points, in order.
 
     Args:
         sweep: Which terminal times.
-        jobs: Processes; 1 computes in this one.
+        jobs: How many points at once; None for one per processor.
+        ray_address: Of the Ray cluster that computes; None for this machine.
         report: Called with the number of points done since the last call.
 
     Raises:
         InvalidInputError: ``jobs`` below 1, or settings that cannot be used.
+        RayMissingError, RayClusterError: No usable cluster at the address.
     """
-    if jobs < 1:
+    if jobs is not None and jobs < 1:
         raise InvalidInputError("jobs", jobs, ">= 1")
-    times = sweep.times_s
-    tasks = [times[i : i + _POINTS_PER_TASK] for i in range(0, len(times), _POINTS_PER_TASK)]
     points: list[SweepPoint] = []
-    if jobs == 1:
-        for task in tasks:
-            points += _evaluate(sweep.settings, task)
-            report(len(task))
-        return points
-    # Spawned, not forked: CasADi and BLAS hold threads and locks.
-    context = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(
-        min(jobs, len(tasks)),
-        mp_context=context,
-        # Ctrl-C reaches every process of the terminal; this one tells the others.
-        initializer=signal.signal,
-        initargs=(signal.SIGINT, signal.SIG_IGN),
-    )
-    with _single_threaded(), pool:
-        futures = [pool.submit(_evaluate, sweep.settings, task) for task in tasks]
-        try:
-            for future in as_completed(futures):
-                done = future.result()
-                points += done
-                report(len(done))
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
-    return sorted(points, key=lambda point: point.terminal_time_s)
+    engine = make_engine(SweepModel(sweep.settings), jobs, ray_address)
+    try:
+        for point in engine.map(sweep.times_s):
+            points.append(point)
+            report(1)
+    finally:
+        engine.close()
+    return points
 
 
 def summarise(sweep: Sweep, points: Sequence[SweepPoint]) -> SweepSummary:
@@ -241,10 +222,22 @@ def summarise(sweep: Sweep, points: Sequence[SweepPoint]) -> SweepSummary:
     )
 
 
-def _evaluate(settings: PlannerSettings, times_s: Sequence[float]) -> list[SweepPoint]:
-    options = ScpOptions.for_gradients(solver=settings.options.solver)
-    planner = Planner(replace(settings, terminal_time=TerminalTime.FIXED, options=options))
-    return [_point(planner, time) for time in times_s]
+@dataclass(frozen=True)
+class SweepModel:
+    """What a worker of the sweep needs. Calling it makes its function.
+
+    Attributes:
+        settings: Of the sweep.
+    """
+
+    settings: PlannerSettings
+
+    def __call__(self) -> Callable[[float], SweepPoint]:
+        """Compile the problem."""
+        options = ScpOptions.for_gradients(solver=self.settings.options.solver)
+        fixed = replace(self.settings, terminal_time=TerminalTime.FIXED, options=options)
+        planner = Planner(fixed)
+        return lambda time_s: _point(planner, time_s)
 
 
 def _point(planner: Planner, time_s: float) -> SweepPoint:
@@ -296,18 +289,3 @@ def _zero(points: Sequence[SweepPoint]) -> float | None:
             step = right.terminal_time_s - left.terminal_time_s
             return left.terminal_time_s + step * before / (before - after)
     return None
-
-
-@contextlib.contextmanager
-def _single_threaded() -> Iterator[None]:
-    """One BLAS thread in each process that is started meanwhile."""
-    before = {name: os.environ.get(name) for name in _THREAD_VARIABLES}
-    os.environ.update(dict.fromkeys(_THREAD_VARIABLES, "1"))
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value

@@ -13,18 +13,20 @@ from typing import TYPE_CHECKING, Any
 from dscp_core.errors import InvalidInputError
 
 if TYPE_CHECKING:
+    from dscp_core.ocp import OptimalControlProblem
     from dscp_core.parameters import Parameter, Value
     from dscp_core.planner import PlannerSettings
     from dscp_core.scp import ScpOptions
 
-DEFAULT_INTERVALS = 50
 # Beyond this, memory and time grow without a visible gain in accuracy.
 MOST_INTERVALS = 2000
 
 
 def add_case_arguments(parser: argparse.ArgumentParser) -> None:
     """Declares the options that describe a case."""
-    parser.add_argument("problem", metavar="PROBLEM", help="what to solve: powered_descent")
+    parser.add_argument(
+        "problem", metavar="PROBLEM", help="what to solve: powered_descent or entry"
+    )
     group = parser.add_argument_group("case")
     group.add_argument(
         "--set",
@@ -48,20 +50,21 @@ def add_case_arguments(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("method")
     group.add_argument(
         "--free-terminal-time",
-        action="store_true",
-        help="let the solver choose the terminal time; --set terminal_time is then a first guess",
+        action=argparse.BooleanOptionalAction,
+        help="let the solver choose the terminal time; --set terminal_time is then a first guess "
+        "(default: for entry)",
     )
     group.add_argument(
         "--formulation",
         metavar="NAME",
-        help="powered_descent: convergent (default), or printed: the paper's appendix as it stands",
+        help="powered_descent: convergent (default), or printed: the paper's appendix as it "
+        "stands; entry: quadratic (default), printed, or printed_per_second",
     )
     group.add_argument(
         "--intervals",
         type=int,
-        default=DEFAULT_INTERVALS,
         metavar="N",
-        help=f"time intervals of the trajectory, 2 to {MOST_INTERVALS} (default %(default)s)",
+        help=f"time intervals of the trajectory, 2 to {MOST_INTERVALS} (default: 50; entry: 100)",
     )
     group.add_argument(
         "--solver",
@@ -70,16 +73,25 @@ def add_case_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def overrides(args: argparse.Namespace) -> dict[str, Value]:
+def overrides(
+    args: argparse.Namespace, problem: OptimalControlProblem | None = None
+) -> dict[str, Value]:
     """Parameters that the case changes, by name.
+
+    Args:
+        args: Parsed arguments.
+        problem: Whose tables the vehicle file may point to; None for a file of parameters alone.
 
     Raises:
         InvalidInputError: A file that cannot be read, or an assignment that cannot be parsed.
     """
     from dscp_core.parameters import load_parameter_file
 
-    from_file = {} if args.vehicle is None else load_parameter_file(args.vehicle)
-    return {**from_file, **parse_assignments(args.assignments)}
+    assigned = parse_assignments(args.assignments)
+    if args.vehicle is None:
+        return assigned
+    read = load_parameter_file if problem is None else problem.read_vehicle
+    return {**read(args.vehicle), **assigned}
 
 
 def parse_assignments(assignments: Sequence[str]) -> dict[str, Value]:
@@ -115,18 +127,24 @@ def planner_settings(args: argparse.Namespace, options: ScpOptions) -> PlannerSe
     """
     from dataclasses import replace
 
+    from dscp_core import problems
     from dscp_core.planner import PlannerSettings, TerminalTime
 
-    if not 2 <= args.intervals <= MOST_INTERVALS:
-        raise InvalidInputError("--intervals", args.intervals, f"[2, {MOST_INTERVALS}]")
+    problem = problems.get(args.problem, args.formulation)
+    intervals = problem.default_intervals if args.intervals is None else args.intervals
+    if not 2 <= intervals <= MOST_INTERVALS:
+        raise InvalidInputError("--intervals", intervals, f"[2, {MOST_INTERVALS}]")
+    free = problem.free_terminal_time
+    if args.free_terminal_time is not None:
+        free = args.free_terminal_time
     if args.solver is not None:
         options = replace(options, solver=args.solver)
     return PlannerSettings(
         problem=args.problem,
         formulation=args.formulation,
-        parameters=overrides(args),
-        intervals=args.intervals,
-        terminal_time=TerminalTime.FREE if args.free_terminal_time else TerminalTime.FIXED,
+        parameters=overrides(args, problem),
+        intervals=intervals,
+        terminal_time=TerminalTime.FREE if free else TerminalTime.FIXED,
         options=options,
     )
 
@@ -139,8 +157,9 @@ def print_parameters(args: argparse.Namespace) -> None:
     """
     from dscp_core import problems
 
-    declared = problems.get(args.problem, args.formulation).table
-    changed = overrides(args)
+    problem = problems.get(args.problem, args.formulation)
+    declared = problem.table
+    changed = overrides(args, problem)
     of_case = declared.with_defaults(changed)
     if args.json:
         parameters = [_described(declared[p.name], p.default) for p in of_case.parameters]

@@ -23,7 +23,8 @@ DESCRIPTION = """\
 Differentiates a plan with respect to parameters of the vehicle, the mission or the algorithm.
 
   --of final_mass   d m_N / d parameter, kg per unit: positive where more of it saves fuel
-  --of cost         d J / d parameter; for powered_descent J is minus the final mass, in kg
+  --of cost         d J / d parameter; for powered_descent J is minus the final mass, in kg, for
+                    entry the integral of gamma^2 + 1.1 (u_1^2 + u_2^2)
   --of convergence  d (sum over k > 1 of |J_k - J_K|) / d parameter: how fast the iterations settle
 
 Methods:
@@ -42,6 +43,7 @@ examples:
   dscp gradient powered_descent --of cost --wrt initial_mass --method implicit --check
   dscp gradient powered_descent --of convergence --wrt trust_region_control \\
       --set trust_region_control=1e-3,1e-3,1e-3 --iterations 6
+  dscp gradient entry --of cost --wrt surface_to_mass_ratio --formulation printed --iterations 5
 
 `dscp gradient powered_descent --list-parameters` lists the names. Units are SI.
 
@@ -128,7 +130,7 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         print_json({"problem": args.problem, **report.as_dict()})
     else:
-        _print(report)
+        _print(report, "kg" if args.of == "final_mass" else planner.problem.cost_unit)
     return ExitCode.NO_PLAN if report.infeasible else ExitCode.OK
 
 
@@ -146,13 +148,14 @@ def _require(args: argparse.Namespace) -> None:
         raise InvalidInputError("--step", args.step, "--check beside it")
 
 
-def _print(report: GradientReport) -> None:
+def _print(report: GradientReport, unit: str) -> None:
+    """Prints the report of a scalar of this unit."""
     verdict = "trusted" if report.trusted else "NOT TRUSTED"
     print(f"gradient of {report.of}, {report.method}, {report.iterations} iterations: {verdict}")
     if report.value is not None:
-        print(f"  {SYMBOLS[report.of]} = {report.value:.9g} kg")
+        print(f"  {SYMBOLS[report.of]} = {report.value:.9g} {_shown(unit)}".rstrip())
     if report.parameters:
-        rows = [row for p in report.parameters for row in _rows(p)]
+        rows = [row for p in report.parameters for row in _rows(p, unit)]
         header = ["parameter", "gradient", ""]
         if len(rows[0]) > len(header):
             header += ["central difference", "uncertainty", "relative error", "step"]
@@ -166,8 +169,13 @@ def _print(report: GradientReport) -> None:
         print(f"  and {hidden} more reasons; see --json")
 
 
-def _rows(parameter: ParameterGradient) -> list[list[str]]:
-    unit = "kg" if parameter.unit == "1" else f"kg per {parameter.unit}"
+def _shown(unit: str) -> str:
+    return "" if unit == "1" else unit
+
+
+def _rows(parameter: ParameterGradient, unit: str) -> list[list[str]]:
+    per = "" if parameter.unit == "1" else f"per {parameter.unit}"
+    unit = f"{_shown(unit)} {per}".strip()
     rows = [
         [parameter.label(component), f"{value: .9g}", unit]
         for component, value in enumerate(parameter.values)

@@ -29,8 +29,8 @@ DESCRIPTION = """\
 Plans one trajectory and certifies it: the true dynamics are integrated under the planned controls,
 and every constraint is checked between the nodes too. Without options it is the paper's case.
 
-Units are SI; x points up, and angles are in rad. A plan for which no certificate can be given is
-no plan: exit code 3.
+Units are SI and angles are in rad; in powered_descent x points up. A plan for which no certificate
+can be given is no plan: exit code 3.
 """
 
 EPILOG = """\
@@ -41,6 +41,8 @@ examples:
   dscp plan powered_descent --free-terminal-time --solver qoco,clarabel
   dscp plan powered_descent --plot plan.png --output plan.csv
   dscp plan powered_descent --set terminal_time=32 --json    (infeasible: exit code 3)
+  dscp plan entry --set surface_to_mass_ratio=0.93 --plot entry.png
+  dscp plan entry --formulation printed --intervals 200
 
 A vehicle file holds lines such as `initial_mass: 25000` and `initial_velocity: [-90, 0, 0]`.
 
@@ -94,7 +96,7 @@ def run(args: argparse.Namespace) -> int:
         return ExitCode.OK
     _check(args)
     from dscp_core.plan import PlanStatus
-    from dscp_core.planner import Planner
+    from dscp_core.planner import Planner, TerminalTime
     from dscp_core.scp import ScpOptions
 
     planner = Planner(planner_settings(args, ScpOptions()))
@@ -102,7 +104,7 @@ def run(args: argparse.Namespace) -> int:
     outcome = planner.plan(planner.initial_state, deadline_s=args.deadline)
     least = None
     without_answer = outcome.status not in (PlanStatus.CERTIFIED, PlanStatus.DEADLINE)
-    if without_answer and not args.free_terminal_time:
+    if without_answer and planner.settings.terminal_time is not TerminalTime.FREE:
         least = _least_terminal_time(planner)
         outcome = _name_least(outcome, least)
     described = describe(planner, outcome, least)
@@ -197,7 +199,10 @@ def _flyable(outcome: PlanOutcome) -> Plan | None:
     return outcome.plan if kept else None
 
 
-def _final_mass(plan: Plan) -> float:
+def _final_mass(plan: Plan) -> float | None:
+    """Mass at the end, where it is a state."""
+    if "mass" not in plan.state_names:
+        return None
     return float(plan.states[-1, plan.state_names.index("mass")])
 
 
@@ -256,6 +261,8 @@ def _print(described: dict[str, Any]) -> None:
     if described["final_mass_kg"] is not None:
         used = certificate["mass_used_kg"]
         rows.append(("final mass", f"{described['final_mass_kg']:.3f} kg", f"{used:.3f} kg used"))
+    elif described["cost"] is not None:
+        rows.append(("cost", f"{described['cost']:.6g}", ""))
     rows.append(
         (
             "iterations",
@@ -268,7 +275,7 @@ def _print(described: dict[str, Any]) -> None:
         print(f"  {label:<15}{value:>14}  {note}".rstrip())
     if status.name != "CERTIFIED":
         print(f"  {described['message']}")
-    if described["final_mass_kg"] is None:
+    if described["cost"] is None:
         return
     print("  certificate, flown with the controls held at interval means:")
     checks = [

@@ -17,6 +17,7 @@ from dscp_ros.cli.output_files import complete_file
 
 # An independent solution of the same discretised problem (CasADi + IPOPT).
 VEHICLES = Path(__file__).parents[2] / "config" / "vehicles"
+LANDERS = [path for path in sorted(VEHICLES.glob("*.yaml")) if "entry" not in path.stem]
 OPTIMAL_TIME_S = 32.8103
 OPTIMAL_MASS_KG = 31760.30
 LEAST_TIME_S = 32.0487
@@ -145,7 +146,7 @@ def test_unknown_problem(capsys: pytest.CaptureFixture[str]) -> None:
     assert "problem: got 'ascent', expected one of powered_descent" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("vehicle", sorted(VEHICLES.glob("*.yaml")), ids=lambda path: path.stem)
+@pytest.mark.parametrize("vehicle", LANDERS, ids=lambda path: path.stem)
 def test_shipped_vehicles_land(plan: Any, vehicle: Path) -> None:
     code, answer = plan("--vehicle", str(vehicle), "--free-terminal-time")
     assert code == ExitCode.OK, answer["message"]

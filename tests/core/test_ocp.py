@@ -79,25 +79,32 @@ def test_least_number_of_intervals(intervals: int) -> None:
 
 
 def test_problems_by_name() -> None:
-    assert problems.names() == ("powered_descent",)
+    assert problems.names() == ("powered_descent", "entry")
+    assert problems.formulations("entry") == ("quadratic", "printed_per_second", "printed")
     assert problems.formulations("powered_descent") == ("convergent", "printed")
     default, named = problems.get("powered_descent"), problems.get("powered_descent", "convergent")
     assert [c.name for c in default.cone_constraints] == [c.name for c in named.cone_constraints]
-    with pytest.raises(InvalidInputError, match="problem: got 'entry'"):
-        problems.get("entry")
+    with pytest.raises(InvalidInputError, match="problem: got 'ascent'"):
+        problems.get("ascent")
     with pytest.raises(InvalidInputError, match="one of convergent, printed"):
         problems.get("powered_descent", "fast")
 
 
-@pytest.mark.parametrize("formulation", problems.formulations("powered_descent"))
-def test_powered_descent_declares_units_and_sources(formulation: str) -> None:
-    problem: OptimalControlProblem = problems.get("powered_descent", formulation)
+@pytest.mark.parametrize(
+    ("name", "formulation"), [(n, f) for n in problems.names() for f in problems.formulations(n)]
+)
+def test_problems_declare_units_and_sources(name: str, formulation: str) -> None:
+    problem: OptimalControlProblem = problems.get(name, formulation)
     assert all(p.unit and p.description for p in problem.table.parameters)
     assert all(p.source for p in problem.parameters)
     assert all(v.unit and v.scale > 0.0 for v in (*problem.states, *problem.controls))
     for p in problem.table.parameters:
         p.validate(p.default)
-    # Each control acts on the state whose unit is its own per mass.
-    assert [problem.states[i].name for i in problem.control_states] == ["vx", "vy", "vz"]
-    x, u = ca.SX.sym("x", 7), ca.SX.sym("u", 3)
-    assert problem.dynamics(x, u, problem.table.unpack(problem.table.pack())).shape == (7, 1)
+    nx, nu = len(problem.states), len(problem.controls)
+    x, u = ca.SX.sym("x", nx), ca.SX.sym("u", nu)
+    values = problem.table.unpack(problem.table.pack())
+    rates = problem.dynamics(x, u, values)
+    assert rates.shape == (nx, 1)
+    # Each control acts on its own state.
+    acts = ca.DM(ca.jacobian(rates, u).sparsity(), 1).full()
+    assert all(acts[state, i] for i, state in enumerate(problem.control_states))

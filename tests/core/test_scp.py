@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 from dscp_core import problems
 from dscp_core.cone_program import SolveStatus
 from dscp_core.errors import InvalidInputError
-from dscp_core.scp import Scp, ScpOptions, ScpResult, ScpStatus, objective
+from dscp_core.scp import Scp, ScpOptions, ScpResult, ScpStatus, StoppingRule, objective
 from dscp_core.solvers import SolverSettings
 from dscp_core.transcription import Transcription
 
@@ -60,6 +61,41 @@ def test_converges(scp: Scp, nominal: ScpResult) -> None:
     last = nominal.iterations[-1]
     assert np.max(np.abs(last.defects) / scale) < 1e-6
     assert np.max(np.abs(last.virtual_control) / scale) < 1e-6
+
+
+def test_tolerances_are_the_problems_unless_given(scp: Scp) -> None:
+    assert (scp.cost_tolerance, scp.defect_tolerance) == (1e-8, 1e-6)
+    loose = Scp(Transcription(replace(cart(), cost_tolerance=1e-2, defect_tolerance=1e-1), 8))
+    assert (loose.cost_tolerance, loose.defect_tolerance) == (1e-2, 1e-1)
+    strict = loose.with_options(cost_tolerance=1e-9, defect_tolerance=1e-9)
+    assert (strict.cost_tolerance, strict.defect_tolerance) == (1e-9, 1e-9)
+    parameters = loose.transcription.table.pack()
+    assert len(loose.run(parameters).iterations) < len(strict.run(parameters).iterations)
+
+
+def test_small_costs_are_judged_by_the_declared_magnitude() -> None:
+    # The cart's cost is 0.4: in units of 1000 every change of it is small.
+    coarse = Scp(Transcription(replace(cart(), cost_magnitude=1000.0), 8))
+    fine = Scp(Transcription(cart(), 8))
+    parameters = fine.transcription.table.pack()
+    options = {"cost_tolerance": 1e-3, "defect_tolerance": 1.0}
+    counts = [len(s.with_options(**options).run(parameters).iterations) for s in (coarse, fine)]
+    assert counts[0] == 2  # the least
+    assert counts[1] > counts[0]
+
+
+def test_the_papers_rule_looks_at_the_cost_alone() -> None:
+    scp = Scp(Transcription(cart(), 8))
+    parameters = scp.transcription.table.pack()
+    by_rule = scp.with_options(stopping=StoppingRule.COST_CHANGE, cost_tolerance=1e-2)
+    result = by_rule.run(parameters)
+    assert result.status is ScpStatus.CONVERGED
+    costs = [i.cost for i in result.iterations]
+    assert abs(costs[-1] - costs[-2]) < 1e-2 * costs[-2]
+    assert all(abs(b - a) >= 1e-2 * a for a, b in itertools.pairwise(costs[:-1]))
+    # The first change is that from the reference it started from.
+    again = by_rule.run(parameters, result.final_reference)
+    assert len(again.iterations) == 1
 
 
 @pytest.mark.parametrize("terminal_time", [31.0, 31.9, 32.0, 32.04])

@@ -321,3 +321,19 @@ def test_time_bounds_are_optional() -> None:
     assert transcription.pattern.n_cone_rows == 2 * 5
     assert transcription.terminal_time(reference, parameters) == 2.0
     assert ca.DM(reference).shape == (1 + 5 * 3, 1)
+
+
+def test_trust_region_per_second_grows_with_the_interval() -> None:
+    weighted = replace(cart(), trust_region_state=(3.0, 0.0), trust_region_control=(5.0,))
+    nodal, timed = (
+        Transcription(p, 4) for p in (weighted, replace(weighted, trust_region_per_second=True))
+    )
+    parameters = nodal.table.pack()
+    reference = nodal.initial_guess(parameters)
+    without = Transcription(cart(), 4).values(reference, cart().table.pack()).q
+    per_node = nodal.values(reference, parameters).q - without
+    per_second = timed.values(reference, parameters).q - without
+    step = 2.0 / 4
+    assert per_node.max() == pytest.approx(10.0)
+    np.testing.assert_allclose(per_second, step * per_node, rtol=1e-12, atol=1e-12)
+    assert {timed.table[n].unit for n in ("trust_region_state", "trust_region_control")} == {"1/s"}

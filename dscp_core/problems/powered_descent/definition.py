@@ -231,6 +231,7 @@ def powered_descent(formulation: Formulation = Formulation.CONVERGENT) -> Optima
         final_state=_FINAL_STATE,
         terminal_cost=lambda x, time, p: p["time_weight"] * time - p["fuel_weight"] * x[6],
         terminal_time_bounds=lambda p: (p["terminal_time_min"], p["terminal_time_max"]),
+        cost_unit="kg",
         cost_scale=_COST_KG,
         cost_terms=(
             CostTerm("mass_flow_curvature", _mass_flow_curvature, Where.MEAN),
