@@ -259,13 +259,17 @@ class TerminalTimeNetwork:
         Raises:
             InvalidInputError: One that fixes the optimum has another value.
         """
-        given = vehicle_of(parameters)
-        for name in sorted(set(given) | set(self.data.vehicle)):
-            mine, other = self.data.vehicle.get(name), given.get(name)
-            if mine != other:
-                raise InvalidInputError(
-                    name, other, f"{mine!r}, which the terminal-time network was trained for"
-                )
+        given, mine = vehicle_of(parameters), self.data.vehicle
+        names = sorted(given.keys() | mine.keys())
+        differing = [name for name in names if mine.get(name) != given.get(name)]
+        if differing:
+            first, *others = differing
+            also = f"; {', '.join(others)} differ too" if others else ""
+            raise InvalidInputError(
+                first,
+                given.get(first),
+                f"{mine.get(first)!r}, which the terminal-time network was trained for{also}",
+            )
 
 
 def vehicle_of(parameters: Mapping[str, Any]) -> dict[str, float | list[float]]:

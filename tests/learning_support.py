@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from dscp_core.errors import InvalidInputError
 from dscp_core.learning.recipes import Fit, Phase, Recipe, Refinement, Supervised
 from dscp_core.learning.sampling import PAPER_BOX
 from dscp_core.terminal_time import FeatureMap, NetworkData, TerminalTimeNetwork
@@ -85,6 +86,14 @@ class KillsItsWorker:
         return item * item
 
 
+class FailsToStart:
+    """A setup with an error."""
+
+    def __call__(self) -> Callable[[int], int]:
+        """Always fails."""
+        raise InvalidInputError("formulation", "wrong", "a known one")
+
+
 def tiny_recipe(**changes: object) -> Recipe:
     """The default recipe, so small that it takes seconds and learns little."""
     fit = Fit(steps=30, batch=32)
@@ -92,6 +101,7 @@ def tiny_recipe(**changes: object) -> Recipe:
         "tiny",
         hidden=(16, 16),
         validation=8,
+        profile_points=2,
         supervised=Supervised(phases=(Phase(12, fit), Phase(24, fit))),
         refinement=Refinement(rounds=2, states=16, fit=fit),
     )

@@ -11,7 +11,14 @@ from numpy.typing import NDArray
 
 from dscp_core import problems
 from dscp_core.learning.evaluator import BestTimeJob, DescentModel, Job, Outcome
-from dscp_core.learning.labels import TRUTH, Progress, best_time_jobs, given_times, run_jobs
+from dscp_core.learning.labels import (
+    TRUTH,
+    LabelError,
+    Progress,
+    best_time_jobs,
+    given_times,
+    run_jobs,
+)
 from dscp_core.learning.nonlinear import NonlinearProgram
 from dscp_core.learning.run import Errors
 from dscp_core.ocp import TERMINAL_TIME
@@ -24,6 +31,8 @@ Array = NDArray[np.float64]
 Predict = Callable[[Array], Array]
 
 _GIVEN = ScpOptions(cost_tolerance=1e-9, max_iterations=60)
+# Whether there is a plan, not how good it is: half the iterations.
+_FEASIBLE = ScpOptions(cost_tolerance=1e-6, max_iterations=60)
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,6 +95,9 @@ def measure(
         symmetric: Whether states that differ by a rotation about the vertical or a reflection
             have the same optimum; such states are solved once.
         progress: Told the number of states of every finished job, twice per state.
+
+    Raises:
+        LabelError: No state has an optimum that is found.
     """
     # 1 mm and 1 um/s: states that are the same but for rounding.
     features = np.round(FeatureMap.AXISYMMETRIC(states), 6)
@@ -95,6 +107,8 @@ def measure(
     unique = states[first]
     jobs = best_time_jobs(unique, TRUTH)
     best = Outcome.join(list(run_jobs(engine, jobs, progress)))
+    if not np.any(best.converged):
+        raise LabelError(f"none of {len(unique)} states has an optimum that converges")
     predicted = predict(unique)
     at_predicted = given_times(
         engine, unique, predicted, _GIVEN, references=best.references, progress=progress
@@ -124,7 +138,7 @@ def infeasible_predictions(
     progress: Progress | None = None,
 ) -> Array:
     """The states (k, 7) of (n, 7) for which no trajectory was found at the predicted time."""
-    outcome = given_times(engine, states, predict(states), _GIVEN, progress=progress)
+    outcome = given_times(engine, states, predict(states), _FEASIBLE, progress=progress)
     failed = np.flatnonzero(~outcome.converged)
     if failed.size:
         # A start from the optimum is closer than one from nothing.
@@ -135,7 +149,7 @@ def infeasible_predictions(
             engine,
             states[failed],
             predict(states[failed]),
-            _GIVEN,
+            _FEASIBLE,
             references=best.references,
         )
         failed = failed[~again.converged]

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -10,6 +12,7 @@ from numpy.typing import NDArray
 
 from dscp_core.learning.evaluation import Measurement
 from dscp_core.plotting import draw_panel_style
+from dscp_core.terminal_time import replace_file
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -24,6 +27,11 @@ _ERRORS = (
     ("validation_p99", "99th percentile", "#7c3aed"),
     ("validation_max", "maximum", "#c2410c"),
 )
+_PROGRESS = (
+    ("mean_abs_slope", "mean |gradient| by the terminal time", _SLOPE),
+    ("mean_abs_slope_kg_s", "mean |DSCP gradient| at the predictions [kg/s]", _SLOPE),
+    ("rms_s", "misfit of the batch [s]", "#1d4ed8"),
+)
 _NAMES = {
     "supervised": "regression",
     "refinement_fit": "DSCP rounds",
@@ -31,8 +39,22 @@ _NAMES = {
 }
 
 
+def write_figure(figure: Figure, path: Path) -> None:
+    """Write a figure as PNG, complete or not at all.
+
+    Raises:
+        FileWriteError: It cannot be written.
+    """
+    content = io.BytesIO()
+    figure.savefig(content, format="png")
+    replace_file(path, content.getvalue())
+
+
 def training_figure(history: Sequence[Mapping[str, Any]], title: str) -> Figure:
     """How a training went: gradient and learning rate, and validation error over wall time.
+
+    On the left as in the paper: per epoch of a descent. For the default recipe, whose fits are
+    not by gradients, the misfit per look at the validation set, and the gradient per round.
 
     Args:
         history: Entries of the history file, at least one.
@@ -88,23 +110,21 @@ def profile_figure(
 
 def _draw_gradients(axes: Axes, history: Sequence[Mapping[str, Any]]) -> None:
     epochs = _column(history, "epoch")
-    slopes = _column(history, "mean_abs_slope")
-    axes.set_title("mean |gradient| by the terminal time, per epoch", fontsize=11, loc="left")
-    if not np.any(np.isfinite(slopes)):
-        slopes = _column(history, "mean_abs_slope_kg_s")
-        epochs = np.arange(1.0, len(slopes) + 1.0)
-        axes.set_title("mean |slope of the fuel| at the predictions", fontsize=11, loc="left")
-    known = np.isfinite(slopes)
-    if np.any(known):
-        axes.semilogy(epochs[known], slopes[known], ".-", color=_SLOPE, linewidth=1.2)
-    axes.set_xlabel("epoch or step")
+    by_epoch = bool(np.any(np.isfinite(epochs)))
+    x = epochs if by_epoch else np.arange(1.0, len(history) + 1.0)
+    for key, label, color in _PROGRESS:
+        values = _column(history, key)
+        known = np.isfinite(values)
+        if np.any(known):
+            axes.semilogy(x[known], values[known], ".-", color=color, linewidth=1.0, label=label)
+    axes.set_title("gradient and learning rate", fontsize=11, loc="left")
+    axes.set_xlabel("epoch" if by_epoch else "tens of Gauss-Newton steps")
+    axes.legend(frameon=False, fontsize=9)
     draw_panel_style(axes)
-    rates = _column(history, "learning_rate")
-    if np.any(np.isfinite(rates)):
-        second = axes.twinx()
-        second.step(epochs, rates, color=_RATE, where="post", linewidth=1.2)
-        second.set_ylabel("learning rate", color=_RATE)
-        second.set_ylim(bottom=0.0)
+    rate = axes.twinx()
+    rate.step(x, _column(history, "learning_rate"), color=_RATE, where="post", linewidth=1.2)
+    rate.set_ylabel("learning rate" if by_epoch else "step length", color=_RATE)
+    rate.set_ylim(bottom=0.0)
 
 
 def _draw_errors(axes: Axes, history: Sequence[Mapping[str, Any]]) -> None:

@@ -14,12 +14,17 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from dscp_core.errors import DscpError
 from dscp_core.learning.network_torch import TorchNetwork
 from dscp_core.learning.recipes import Fit
 
 Array = NDArray[np.float64]
 
 _DAMPING_SHARE = 0.2
+
+
+class FitError(DscpError):
+    """A fit whose numbers are no longer finite."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,19 +80,26 @@ class GaussNewton:
 
         Returns:
             Weighted mean squared error of the batch before the step, s^2.
+
+        Raises:
+            FitError: The step is not finite; the network is unchanged.
         """
         count = min(self._settings.batch, len(targets.times_s))
         batch = torch.from_numpy(rng.choice(len(targets.times_s), count, replace=False))
         start = torch.nn.utils.parameters_to_vector(self._network.parameters())
         loss, direction = self._direction(targets, batch, start)
+        if not torch.isfinite(direction).all():
+            raise FitError(f"step {self.number + 1} of the fit: not finite")
         torch.nn.utils.vector_to_parameters(
-            start + self._length() * direction, self._network.parameters()
+            start + self.length * direction, self._network.parameters()
         )
         self.last = direction.numpy()
         self.number += 1
         return loss
 
-    def _length(self) -> float:
+    @property
+    def length(self) -> float:
+        """Share of the next step that is taken."""
         left = 1.0 - self.number / self._settings.steps
         return self._settings.step_length * min(1.0, 2.0 * left)
 
@@ -119,7 +131,9 @@ class GaussNewton:
             explained += torch.sum((value @ weight.T + bias) * slope, dim=1)
             done += size + slope.shape[1]
         gram.diagonal().add_((damping + decay) * len(batch))
-        factor = torch.linalg.cholesky(gram)
+        factor, refused = torch.linalg.cholesky_ex(gram)
+        if refused:
+            raise FitError(f"step {self.number + 1} of the fit: J J' is not positive definite")
         solved = torch.cholesky_solve((residual - explained)[:, None], factor)
         parts = []
         for value, slope in zip(inputs, slopes, strict=True):

@@ -92,15 +92,24 @@ def best_times(
     states: Array,
     options: ScpOptions,
     progress: Progress | None = None,
+    *,
+    most_failures: float = MOST_FAILURES,
 ) -> Labels:
     """Optimal terminal times of states (n, 7), but for those that do not converge.
 
+    Args:
+        engine: Evaluates.
+        states: (n, 7).
+        options: How to iterate.
+        progress: Told the number of states of every finished job.
+        most_failures: Share of the states that may not converge.
+
     Raises:
-        LabelError: More than a few do not.
+        LabelError: More do not.
     """
     jobs = best_time_jobs(states, options)
     outcome = Outcome.join(list(run_jobs(engine, jobs, progress)))
-    check_failures(states, outcome.converged)
+    check_failures(states, outcome.converged, most_failures)
     found = outcome.converged
     return Labels(
         states[found],
@@ -110,13 +119,15 @@ def best_times(
     )
 
 
-def check_failures(states: Array, found: NDArray[np.bool_]) -> None:
-    """Refuse to go on without the optimum of more than a few states (n, 7).
+def check_failures(
+    states: Array, found: NDArray[np.bool_], most_failures: float = MOST_FAILURES
+) -> None:
+    """Refuse to go on without the optimum of more than a share of states (n, 7).
 
     Raises:
         LabelError: They are too many.
     """
-    if np.count_nonzero(~found) > MOST_FAILURES * len(states):
+    if np.count_nonzero(~found) > most_failures * len(states):
         row = int(np.flatnonzero(~found)[0])
         raise LabelError(
             f"{np.count_nonzero(~found)} of {len(states)} states have no optimum that converges, "

@@ -123,7 +123,7 @@ class Descent:
     slope_unit_kg_s: float = 10.0
     slope_limit: float = 5.0
     max_iterations: int = 20
-    validate_every: int = 10
+    validate_every: int = 1
 
     def learning_rate(self, epoch: int) -> float:
         """Rate of an epoch."""
@@ -142,6 +142,7 @@ class Recipe:
         widening: Share by which the sampling box is wider than the one to be good in.
         mixture: Which states to learn from.
         validation: Number of states of the validation set.
+        profile_points: Points per axis of the paper's two profiles, whose errors are recorded.
         supervised: First stage, or None.
         refinement: Second stage, or None.
         descent: Third stage, or None.
@@ -155,6 +156,7 @@ class Recipe:
     widening: float = 0.03
     mixture: Mixture = field(default_factory=lambda: Mixture(edges=0.2, outbound=0.3, slow=0.2))
     validation: int = 512
+    profile_points: int = 7
     supervised: Supervised | None = None
     refinement: Refinement | None = None
     descent: Descent | None = None

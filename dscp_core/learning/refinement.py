@@ -35,11 +35,12 @@ def refine(run: Run) -> None:
     while progress["round"] < settings.rounds and progress["waited"] < settings.patience:
         if not progress["planned"]:
             _plan(run, settings, progress["round"])
-            progress["planned"] = True
+            # Kept, so that a training that is killed during the fit still knows it.
+            progress |= {"planned": True, "best": run.document["best"]}
             run.save()
-        before = run.document["best"]
         _fit(run, settings, progress["round"])
-        progress["waited"] = 0 if run.document["best"] < before else progress["waited"] + 1
+        improved = run.document["best"] < progress["best"]
+        progress["waited"] = 0 if improved else progress["waited"] + 1
         progress["round"] += 1
         progress["planned"] = False
         run.save()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -17,16 +18,25 @@ from tqdm import tqdm
 from dscp_core.errors import DscpError
 from dscp_core.learning.checkpoint import CHECKPOINT_FILE, Checkpoint, CheckpointError
 from dscp_core.learning.evaluator import Job, Outcome
-from dscp_core.learning.labels import LABELLING, best_times
+from dscp_core.learning.labels import LABELLING, MOST_FAILURES, best_times
 from dscp_core.learning.network_torch import TorchNetwork
 from dscp_core.learning.recipes import Recipe
-from dscp_core.learning.sampling import PAPER_BOX, StateBox
+from dscp_core.learning.sampling import (
+    PAPER_BOX,
+    StateBox,
+    horizontal_profile,
+    vertical_profile,
+)
 from dscp_core.parallel import Engine
 
 Array = NDArray[np.float64]
 
 _SECONDS_BETWEEN_CHECKPOINTS = 10.0
 _NETWORK_SAMPLES = 4096
+# Recorded for the reader; the network is chosen by the validation set alone.
+_PROFILES = {"vertical": vertical_profile, "horizontal": horizontal_profile}
+_MOST_FAILURES = 0.5  # of the profiles; each is one cut, and some vehicles may not land from there
+_BAR_INTERVAL_S = (0.1, 30.0)
 _PURPOSES = (
     "weights",
     "validation",
@@ -103,7 +113,7 @@ class Run:
         self.arrays: dict[str, NDArray[Any]] = {}
         self.document: dict[str, Any] = {
             "identity": json.loads(json.dumps(identity)),
-            "stage": "validation",
+            "stage": "supervised",
             "history": [],
             "elapsed_s": 0.0,
             "best": math.inf,
@@ -134,27 +144,38 @@ class Run:
         return np.random.default_rng([self._seed, _PURPOSES.index(purpose), *counters])
 
     def bar(self, total: int, label: str, done: int = 0) -> tqdm[Any]:
-        """A progress bar."""
+        """A progress bar; a line now and then where no one watches."""
         return tqdm(
-            total=total, desc=label, initial=done, disable=None if self.show_progress else True
+            total=total,
+            desc=label,
+            initial=done,
+            disable=not self.show_progress,
+            mininterval=_BAR_INTERVAL_S[not sys.stderr.isatty()],
         )
 
-    def ensure_validation(self) -> None:
-        """Solve the validation set, unless that is done."""
-        if "validation.states" in self.arrays:
-            return
-        count = self.recipe.validation
-        with self.bar(count, "validation set") as bar:
-            states = PAPER_BOX.uniform(count, self.rng("validation"))
-            labels = best_times(self.engine, states, LABELLING, bar.update)
-        self.arrays["validation.states"] = labels.states
-        self.arrays["validation.terminal_time_s"] = labels.terminal_time_s
-        self.save()
+    def ensure_truth(self) -> None:
+        """Solve the validation set and coarse profiles, unless that is done."""
+        sets = {"validation": PAPER_BOX.uniform(self.recipe.validation, self.rng("validation"))}
+        sets |= {name: make(self.recipe.profile_points) for name, make in _PROFILES.items()}
+        for name, states in sets.items():
+            if f"{name}.states" in self.arrays:
+                continue
+            with self.bar(len(states), f"{name} set") as bar:
+                labels = best_times(
+                    self.engine,
+                    states,
+                    LABELLING,
+                    bar.update,
+                    most_failures=_MOST_FAILURES if name in _PROFILES else MOST_FAILURES,
+                )
+            self.arrays[f"{name}.states"] = labels.states
+            self.arrays[f"{name}.terminal_time_s"] = labels.terminal_time_s
+            self.save()
 
-    def validate(self) -> Errors:
-        """Errors of the network on the validation set."""
-        predicted = self.network.predict(self.arrays["validation.states"])
-        return Errors.of(predicted, self.arrays["validation.terminal_time_s"])
+    def validate(self, name: str = "validation") -> Errors:
+        """Errors of the network on the validation set, or on a profile."""
+        predicted = self.network.predict(self.arrays[f"{name}.states"])
+        return Errors.of(predicted, self.arrays[f"{name}.terminal_time_s"])
 
     def record(self, stage: str, **entry: float | int | None) -> Errors:
         """Append to the history; keeps the network when it is the best so far.
@@ -176,6 +197,7 @@ class Run:
                 "validation_p99": errors.p99,
                 "validation_max": errors.maximum,
                 "validation_rms": errors.rms,
+                **{f"{name}_max": self.validate(name).maximum for name in _PROFILES},
             }
         )
         if errors.rms < self.document["best"]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -91,6 +93,9 @@ def fit_targets(
         wanted: What to fit.
         label: Of the progress bar.
         **entry: For the history.
+
+    Raises:
+        FitError: The numbers are no longer finite.
     """
     fit = GaussNewton(run.network, settings)
     progress = run.document.setdefault(name, {"step": 0, "fits": 0})
@@ -99,12 +104,14 @@ def fit_targets(
         fit.number, fit.last = progress["step"], run.arrays[key]
     with run.bar(settings.steps, label, fit.number) as bar:
         while not fit.done:
+            length = fit.length
             loss = fit.step(wanted, run.rng(name, progress["fits"], fit.number))
             progress["step"], run.arrays[key] = fit.number, fit.last
             bar.update()
             if fit.number % _RECORD_EVERY == 0 or fit.done:
-                errors = run.record(name, loss_s2=loss, **entry)
-                shown = {"loss": f"{loss:.1e}", "validation": f"{errors.rms:.1e}", **entry}
+                rms_s = math.sqrt(loss)
+                errors = run.record(name, rms_s=rms_s, learning_rate=length, **entry)
+                shown = {"loss_s": f"{rms_s:.1e}", "validation": f"{errors.rms:.1e}", **entry}
                 bar.set_postfix(shown)
             run.save(even_if_recent=False)
     progress["step"], progress["fits"] = 0, progress["fits"] + 1

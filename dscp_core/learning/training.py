@@ -21,7 +21,7 @@ from dscp_core.learning.refinement import refine
 from dscp_core.learning.run import Errors, Run, stage
 from dscp_core.learning.sampling import PAPER_BOX
 from dscp_core.learning.supervised import supervise
-from dscp_core.parallel import ProcessEngine
+from dscp_core.parallel import make_engine
 from dscp_core.parameters import Value
 from dscp_core.problems import powered_descent
 from dscp_core.terminal_time import FeatureMap, TerminalTimeNetwork, replace_file, vehicle_of
@@ -42,7 +42,8 @@ class TrainingSettings:
         parameters: Vehicle and mission parameters that differ from the defaults, SI.
         intervals: Number of intervals of the discretisation.
         seed: Of everything random.
-        workers: Processes that evaluate states.
+        workers: Processes that evaluate states; None for one per processor.
+        ray_address: Of the Ray cluster that evaluates states; None for this machine.
         resume: Go on from the checkpoint in the folder.
         show_progress: Whether to draw progress bars.
     """
@@ -52,7 +53,8 @@ class TrainingSettings:
     parameters: Mapping[str, Value]
     intervals: int = 50
     seed: int = 0
-    workers: int = 1
+    workers: int | None = 1
+    ray_address: str | None = None
     resume: bool = False
     show_progress: bool = False
 
@@ -83,6 +85,7 @@ def train(settings: TrainingSettings) -> TrainingResult:
             training.
         FileNotFoundError: `resume` is set and there is no checkpoint.
         TrainingError: The training cannot go on.
+        RayMissingError, RayClusterError: No usable cluster at the address.
         FileWriteError: The folder cannot be written to.
     """
     recipe = settings.recipe
@@ -99,9 +102,8 @@ def train(settings: TrainingSettings) -> TrainingResult:
         raise CheckpointError(f"{path} exists: resume that training, or choose another folder")
     # Two threads add up in another order than one: results would depend on the machine.
     torch.set_num_threads(1)
-    engine = ProcessEngine(
-        DescentModel(parameters=parameters, intervals=settings.intervals), settings.workers
-    )
+    model = DescentModel(parameters=parameters, intervals=settings.intervals)
+    engine = make_engine(model, settings.workers, settings.ray_address)
     try:
         run = Run(
             recipe,
@@ -138,7 +140,7 @@ def _require_symmetry(values: Mapping[str, Any]) -> None:
 
 
 def _stages(run: Run) -> None:
-    stage(run, "validation", "supervised", Run.ensure_validation)
+    run.ensure_truth()
     stage(run, "supervised", "refinement", supervise)
     stage(run, "refinement", "descent", refine)
     stage(run, "descent", "done", descend)

@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import argparse
-import os
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+from tqdm import tqdm
+
 from dscp_core.errors import InvalidInputError
 from dscp_ros.cli import ExitCode
 from dscp_ros.cli.arguments import overrides, print_json, print_table
-from dscp_ros.cli.output_files import complete_file
 
 if TYPE_CHECKING:
     from dscp_core.learning.evaluation import Measurement
+    from dscp_core.learning.evaluator import DescentModel, Job, Outcome
+    from dscp_core.parallel import Engine
+    from dscp_core.terminal_time import TerminalTimeNetwork
 
 DESCRIPTION = "Measures what was learnt against brute force."
 
@@ -47,6 +51,7 @@ examples:
 PROFILE_POINTS = 11
 LATERAL_POINTS = 21
 IPOPT_STATES = 20
+SETS = ("vertical", "horizontal", "box")
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -87,7 +92,10 @@ def _add_terminal_time(parts: argparse._SubParsersAction[argparse.ArgumentParser
         "--seed", type=int, default=1, metavar="N", help="of the random states (default 1)"
     )
     parser.add_argument(
-        "--workers", type=int, metavar="N", help="processes (default: one per processor)"
+        "--workers", type=int, metavar="N", help="how many at once (default: one per processor)"
+    )
+    parser.add_argument(
+        "--ray", metavar="ADDRESS", help="compute on the Ray cluster with this head, HOST:PORT"
     )
     parser.add_argument(
         "--output", type=Path, metavar="DIR", help="draw the two profiles into this directory"
@@ -122,16 +130,11 @@ def run_terminal_time(args: argparse.Namespace) -> int:
             raise InvalidInputError(f"--{name.replace('_', '-')}", getattr(args, name), ">= 1")
     if args.output is not None and args.output.exists() and not args.output.is_dir():
         raise InvalidInputError("--output", str(args.output), "a directory")
-    import numpy as np
-    from tqdm import tqdm
-
     from dscp_core import problems
-    from dscp_core.learning import evaluation
     from dscp_core.learning.evaluator import DescentModel
-    from dscp_core.learning.sampling import PAPER_BOX, horizontal_profile, vertical_profile
-    from dscp_core.parallel import ProcessEngine
+    from dscp_core.parallel import make_engine
     from dscp_core.problems import powered_descent
-    from dscp_core.terminal_time import DEFAULT_NETWORK, FeatureMap, TerminalTimeNetwork
+    from dscp_core.terminal_time import DEFAULT_NETWORK, TerminalTimeNetwork
 
     table = problems.get(powered_descent.NAME).table
     parameters = overrides(args)
@@ -140,39 +143,15 @@ def run_terminal_time(args: argparse.Namespace) -> int:
         vehicle=table.unpack(table.pack(parameters)),
     )
     model = DescentModel({**parameters, "mean_thrust_fraction": 1.0}, None, network.data.intervals)
-    workers = len(os.sched_getaffinity(0)) if args.workers is None else args.workers
     rng = np.random.default_rng(args.seed)
-    sets = {
-        "vertical": vertical_profile(PROFILE_POINTS),
-        "horizontal": horizontal_profile(LATERAL_POINTS),
-    }
-    if not args.quick:
-        sets["box"] = PAPER_BOX.uniform(args.samples, rng)
-    measurements: dict[str, Measurement] = {}
-    document: dict[str, Any] = {"vertical": None, "horizontal": None, "box": None}
-    engine = ProcessEngine(model, workers)
+    engine = make_engine(model, args.workers, args.ray)
     try:
-        for name, states in sets.items():
-            with tqdm(desc=name, unit="plan", disable=None) as bar:
-                measurements[name] = evaluation.measure(
-                    engine,
-                    network.evaluate,
-                    states,
-                    symmetric=network.data.features is FeatureMap.AXISYMMETRIC,
-                    progress=bar.update,
-                )
-            document[name] = measurements[name].document()
+        measurements = _measure(args, engine, network, rng)
+        document: dict[str, Any] = {
+            name: measurements[name].document() if name in measurements else None for name in SETS
+        }
         if not args.quick:
-            further = PAPER_BOX.uniform(args.feasibility_samples, rng)
-            with tqdm(desc="feasibility", total=len(further), unit="plan", disable=None) as bar:
-                refused = evaluation.infeasible_predictions(
-                    engine, network.evaluate, further, progress=bar.update
-                )
-            document["feasibility"] = {"states": len(further), "infeasible": len(refused)}
-            with tqdm(desc="IPOPT", total=IPOPT_STATES, unit="state", disable=None) as bar:
-                checked = PAPER_BOX.uniform(IPOPT_STATES, rng)
-                check = evaluation.check_against_ipopt(engine, model, checked, bar.update)
-            document["ipopt"] = asdict(check)
+            document |= _check(args, engine, network, model, rng)
     finally:
         engine.close()
     files = [] if args.output is None else _draw(args.output, measurements)
@@ -184,10 +163,64 @@ def run_terminal_time(args: argparse.Namespace) -> int:
     return ExitCode.OK
 
 
-def _draw(output: Path, measurements: dict[str, Measurement]) -> list[Path]:
-    from dscp_core.learning.figures import profile_figure
+def _measure(
+    args: argparse.Namespace,
+    engine: Engine[Job, Outcome],
+    network: TerminalTimeNetwork,
+    rng: np.random.Generator,
+) -> dict[str, Measurement]:
+    """Errors and fuel on every set."""
+    from dscp_core.learning import evaluation
+    from dscp_core.learning.sampling import PAPER_BOX, horizontal_profile, vertical_profile
+    from dscp_core.terminal_time import FeatureMap
 
-    output.mkdir(parents=True, exist_ok=True)
+    sets = {
+        "vertical": vertical_profile(PROFILE_POINTS),
+        "horizontal": horizontal_profile(LATERAL_POINTS),
+    }
+    if not args.quick:
+        sets["box"] = PAPER_BOX.uniform(args.samples, rng)
+    measurements = {}
+    for name, states in sets.items():
+        with tqdm(desc=name, unit="plan", disable=None) as bar:
+            measurements[name] = evaluation.measure(
+                engine,
+                network.evaluate,
+                states,
+                symmetric=network.data.features is FeatureMap.AXISYMMETRIC,
+                progress=bar.update,
+            )
+    return measurements
+
+
+def _check(
+    args: argparse.Namespace,
+    engine: Engine[Job, Outcome],
+    network: TerminalTimeNetwork,
+    model: DescentModel,
+    rng: np.random.Generator,
+) -> dict[str, Any]:
+    """Feasibility of many predictions, and optimal times against IPOPT."""
+    from dscp_core.learning import evaluation
+    from dscp_core.learning.sampling import PAPER_BOX
+
+    further = PAPER_BOX.uniform(args.feasibility_samples, rng)
+    with tqdm(desc="feasibility", total=len(further), unit="plan", disable=None) as bar:
+        refused = evaluation.infeasible_predictions(
+            engine, network.evaluate, further, progress=bar.update
+        )
+    with tqdm(desc="IPOPT", total=IPOPT_STATES, unit="state", disable=None) as bar:
+        checked = PAPER_BOX.uniform(IPOPT_STATES, rng)
+        check = evaluation.check_against_ipopt(engine, model, checked, bar.update)
+    return {
+        "feasibility": {"states": len(further), "infeasible": len(refused)},
+        "ipopt": asdict(check),
+    }
+
+
+def _draw(output: Path, measurements: dict[str, Measurement]) -> list[Path]:
+    from dscp_core.learning.figures import profile_figure, write_figure
+
     axes = {
         "vertical": ((3, 0), ("v_x [m/s]", "r_x [m]")),
         "horizontal": ((1, 2), ("r_y [m]", "r_z [m]")),
@@ -195,17 +228,15 @@ def _draw(output: Path, measurements: dict[str, Measurement]) -> list[Path]:
     files = []
     for name, (columns, labels) in axes.items():
         path = output / f"terminal_time_{name}.png"
-        with complete_file(path) as partial:
-            profile_figure(
-                measurements[name], columns, labels, f"Terminal-time network, {name} profile"
-            ).savefig(partial)
+        title = f"Terminal-time network, {name} profile"
+        write_figure(profile_figure(measurements[name], columns, labels, title), path)
         files.append(path)
     return files
 
 
 def _print(document: dict[str, Any]) -> None:
     rows = []
-    for name in ("vertical", "horizontal", "box"):
+    for name in SETS:
         figures = document[name]
         if figures is not None:
             rows.append(

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import os
 from pathlib import Path
 
 from dscp_core.errors import InvalidInputError
 from dscp_ros.cli import ExitCode
 from dscp_ros.cli.arguments import overrides, print_json
-from dscp_ros.cli.output_files import complete_file
 
 DESCRIPTION = "Trains a part of the planner."
 
@@ -81,7 +79,10 @@ def _add_terminal_time(parts: argparse._SubParsersAction[argparse.ArgumentParser
         "--seed", type=int, default=0, metavar="N", help="of everything random (default 0)"
     )
     parser.add_argument(
-        "--workers", type=int, metavar="N", help="processes (default: one per processor)"
+        "--workers", type=int, metavar="N", help="how many at once (default: one per processor)"
+    )
+    parser.add_argument(
+        "--ray", metavar="ADDRESS", help="compute on the Ray cluster with this head, HOST:PORT"
     )
     parser.add_argument("--json", action="store_true", help="print the result as JSON on stdout")
     group = parser.add_argument_group("vehicle")
@@ -120,7 +121,7 @@ def run_terminal_time(args: argparse.Namespace) -> int:
     """
     if args.output.exists() and not args.output.is_dir():
         raise InvalidInputError("--output", str(args.output), "a directory")
-    from dscp_core.learning.figures import training_figure
+    from dscp_core.learning.figures import training_figure, write_figure
     from dscp_core.learning.recipes import adjusted, recipe
     from dscp_core.learning.training import TrainingSettings, train
 
@@ -138,16 +139,16 @@ def run_terminal_time(args: argparse.Namespace) -> int:
             parameters=overrides(args),
             intervals=args.intervals,
             seed=args.seed,
-            workers=len(os.sched_getaffinity(0)) if args.workers is None else args.workers,
+            workers=args.workers,
+            ray_address=args.ray,
             resume=args.resume,
             show_progress=not args.json,
         )
     )
     picture = args.output / "training.png"
-    with complete_file(picture) as partial:
-        training_figure(result.history, f"Terminal-time network, recipe {chosen.name}").savefig(
-            partial
-        )
+    write_figure(
+        training_figure(result.history, f"Terminal-time network, recipe {chosen.name}"), picture
+    )
     summary = {
         "network": str(result.network),
         "figure": str(picture),

@@ -13,13 +13,6 @@ from dscp_ros.cli import ExitCode, evaluate_command
 from dscp_ros.cli import main as frame
 
 
-@pytest.fixture(autouse=True)
-def commands(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in ("train", "evaluate"):
-        command = frame.Command(f"dscp_ros.cli.{name}_command", "learn")
-        monkeypatch.setitem(frame.COMMANDS, name, command)
-
-
 @pytest.fixture
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
     """Makes the default recipe and the evaluated sets small."""
@@ -49,26 +42,21 @@ def test_train_then_evaluate(
 
     evaluate = ["evaluate", "terminal-time", summary["network"], "--workers", "1"]
     figures = tmp_path / "figures"
-    quick = [*evaluate, "--quick", "--json", "--output", str(figures)]
-    assert frame.main(quick) == ExitCode.OK
+    full = [*evaluate, "--samples", "2", "--feasibility-samples", "2"]
+    assert frame.main([*full, "--json", "--output", str(figures)]) == ExitCode.OK
     document = json.loads(capsys.readouterr().out)
-    for name in ("vertical", "horizontal"):
+    for name in ("vertical", "horizontal", "box"):
         for key in ("max", "p99", "mean"):
             assert 0.0 < document[name][f"{key}_relative_error"] < 0.1
-    assert document["box"] is None
-    assert all(Path(name).is_file() for name in document["files"])
-    assert len(document["files"]) == 2
-
-    full = [*evaluate, "--samples", "2", "--feasibility-samples", "2"]
-    assert frame.main([*full, "--json"]) == ExitCode.OK
-    document = json.loads(capsys.readouterr().out)
     assert document["box"]["states"] == 2
     assert document["feasibility"]["states"] == 2
     assert document["ipopt"]["max_relative_difference"] < 1e-3
-    assert frame.main(full) == ExitCode.OK
+    assert all(Path(name).is_file() for name in document["files"])
+    assert len(document["files"]) == 2
+    assert frame.main([*evaluate, "--quick"]) == ExitCode.OK
     text = capsys.readouterr().out
     assert "vertical" in text
-    assert "IPOPT" in text
+    assert "box" not in text
 
 
 @pytest.mark.parametrize(
@@ -93,6 +81,26 @@ def test_bad_input(
     monkeypatch.chdir(tmp_path)
     assert frame.main(arguments) == ExitCode.BAD_INPUT
     assert message in capsys.readouterr().err
+
+
+def test_built_in_network_is_that_good(small: None, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ["evaluate", "terminal-time", "--quick", "--json", "--workers", "1"]
+    assert frame.main(arguments) == ExitCode.OK
+    document = json.loads(capsys.readouterr().out)
+    for name in ("vertical", "horizontal"):
+        # The target on the whole profiles; these are their corners and centers.
+        assert document[name]["max_relative_error"] < 1e-4
+        assert document[name]["infeasible"] == 0
+
+
+def test_tampered_network(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "net.safetensors"
+    network().save(path)
+    content = bytearray(path.read_bytes())
+    content[-5] ^= 1
+    path.write_bytes(bytes(content))
+    assert frame.main(["evaluate", "terminal-time", str(path)]) == ExitCode.BAD_INPUT
+    assert "the file was changed" in capsys.readouterr().err
 
 
 def test_network_of_another_vehicle(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from learning_support import network
@@ -13,7 +15,8 @@ from dscp_core.learning.evaluation import (
     measure,
 )
 from dscp_core.learning.evaluator import DescentEvaluator, DescentModel
-from dscp_core.learning.figures import profile_figure, training_figure
+from dscp_core.learning.figures import profile_figure, training_figure, write_figure
+from dscp_core.learning.labels import LabelError
 from dscp_core.learning.sampling import PAPER_BOX, horizontal_profile
 from dscp_core.parallel import SerialEngine
 
@@ -75,6 +78,13 @@ def test_infeasible_predictions_are_counted(
     np.testing.assert_array_equal(refused, STATES[1:2])
 
 
+def test_states_without_any_optimum(engine: SerialEngine) -> None:  # type: ignore[type-arg]
+    state = STATES[:1].copy()
+    state[0, 3] = -900.0  # hits the ground in six seconds
+    with pytest.raises(LabelError, match="none of 1 states"):
+        measure(engine, network().evaluate, state, symmetric=False)
+
+
 def test_symmetric_states_are_solved_once(engine: SerialEngine) -> None:  # type: ignore[type-arg]
     states = horizontal_profile(3)
     solved: list[int] = []
@@ -95,17 +105,21 @@ def test_optimum_is_that_of_ipopt(engine: SerialEngine) -> None:  # type: ignore
     assert check.max_mass_difference_kg < 0.02
 
 
-def test_figures_are_drawn(truth: Measurement, engine: SerialEngine, tmp_path: object) -> None:  # type: ignore[type-arg]
+def test_figures_are_drawn(truth: Measurement, engine: SerialEngine, tmp_path: Path) -> None:  # type: ignore[type-arg]
     profile = measure(engine, network().evaluate, horizontal_profile(3), symmetric=True)
     figure = profile_figure(profile, (1, 2), ("y", "z"), "horizontal")
     assert len(figure.axes) == 4, "two panels and two color bars"
     errors = {f"validation_{name}": 1e-3 for name in ("mean", "p99", "max", "rms")}
-    regression = [{"stage": "supervised", "elapsed_s": 1.0, "loss_s2": 1e-4, **errors}]
+    regression = [{"stage": "supervised", "elapsed_s": 1.0, "rms_s": 1e-2, **errors}]
     rounds = [
         {"stage": "refinement_fit", "elapsed_s": 2.0, "mean_abs_slope_kg_s": 3.0, **errors}
     ] * 2
     figure = training_figure([*regression, *rounds], "default")
-    assert [len(line.get_xdata()) for line in figure.axes[0].get_lines()] == [2]
+    found = [line.get_xdata().tolist() for line in figure.axes[0].get_lines()]
+    assert found == [[2.0, 3.0], [1.0]], "slopes of two rounds, misfit of the regression"
+    path = tmp_path / "training.png"
+    write_figure(figure, path)
+    assert path.read_bytes().startswith(b"\x89PNG")
     descent = [
         {
             "stage": "descent",

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from dscp_core.learning.gauss_newton import GaussNewton, Targets
+from dscp_core.learning.gauss_newton import FitError, GaussNewton, Targets
 from dscp_core.learning.network_torch import TorchNetwork
 from dscp_core.learning.recipes import Fit
 from dscp_core.learning.sampling import PAPER_BOX
@@ -77,6 +77,25 @@ def test_steps_get_shorter_and_end() -> None:
         moved.append(float(torch.linalg.norm(after - before)) / np.linalg.norm(fit.last))
     np.testing.assert_allclose(moved[:6], 0.1)
     np.testing.assert_allclose(moved[6:], [0.08, 0.06, 0.04, 0.02])
+
+
+def test_numbers_that_are_not_finite_are_an_error() -> None:
+    network = small_network()
+    before = network.tensors()
+    times = torch.full((len(STATES),), 34.0, dtype=torch.float64)
+    times[7] = torch.nan
+    inputs = network.inputs(STATES)
+    fit = GaussNewton(network, Fit(steps=3, batch=len(STATES)))
+    with pytest.raises(FitError, match="step 1"):
+        fit.step(Targets(inputs, times, torch.ones_like(times)), np.random.default_rng(0))
+    inputs[3, 2] = torch.nan
+    with pytest.raises(FitError, match="step 1"):
+        fit.step(
+            Targets(inputs, torch.nan_to_num(times), torch.ones_like(times)),
+            np.random.default_rng(0),
+        )
+    for name, tensor in network.tensors().items():
+        np.testing.assert_array_equal(tensor, before[name])
 
 
 def test_fits_a_smooth_function() -> None:

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import json
+import resource
+import shutil
 import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,6 +21,7 @@ from learning_support import tiny_recipe, tiny_training
 from dscp_core import problems
 from dscp_core.errors import InvalidInputError
 from dscp_core.learning.checkpoint import CHECKPOINT_FILE, Checkpoint, CheckpointError
+from dscp_core.learning.descent import descend
 from dscp_core.learning.evaluator import GradientMethod, Outcome
 from dscp_core.learning.recipes import RECIPES, Descent, adjusted, recipe
 from dscp_core.learning.refinement import refine
@@ -39,6 +44,7 @@ def test_training_learns(trained: Path) -> None:
     best = min(entry["validation_rms"] for entry in history)
     # 24 labels of a function that varies by 3e-2: more than the mean has been learnt.
     assert best < 1.5e-2
+    assert all(entry["vertical_max"] > 0.0 for entry in history)
     table = problems.get("powered_descent").table
     network = TerminalTimeNetwork.load(trained / NETWORK_FILE, vehicle=table.unpack(table.pack()))
     assert network.data.intervals == 20
@@ -135,11 +141,13 @@ def test_the_papers_recipe(tmp_path: Path) -> None:
     small = replace(
         paper,
         validation=4,
+        profile_points=2,
         descent=replace(paper.descent, epochs=3, samples=8, batch=4, validate_every=1),
     )
     result = train(tiny_training(tmp_path, recipe=small))
     assert [entry["epoch"] for entry in result.history] == [1, 2, 3]
     assert all(entry["learning_rate"] == 0.01 for entry in result.history)
+    assert all(5000.0 < entry["mean_fuel_kg"] < 8000.0 for entry in result.history)
     # The start is the middle of [31, 37] s, which is late for most of the states: slopes count.
     assert all(0.0 < entry["mean_abs_slope"] <= 5.0 for entry in result.history)
     assert TerminalTimeNetwork.load(result.network).data.interval_s == (31.0, 37.0)
@@ -182,6 +190,34 @@ def test_all_samples_failing_is_an_error(tmp_path: Path) -> None:
     run = Run(tiny_recipe(), _NoSlopes(), tmp_path, 0, identity={})  # type: ignore[arg-type]
     with pytest.raises(TrainingError, match="no state has a slope"):
         refine(run)
+    descent = Descent(epochs=9, samples=4, batch=2, validate_every=10)
+    small = tiny_recipe(supervised=None, refinement=None, descent=descent)
+    run = Run(small, _NoSlopes(), tmp_path, 0, identity={})  # type: ignore[arg-type]
+    with pytest.raises(TrainingError, match="all states of 3 epochs have failed"):
+        descend(run)
+
+
+@contextmanager
+def files_no_longer_than(size: int) -> Iterator[None]:
+    """A full disk, but for the number of the error: the operating system refuses to write."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+def test_full_disk_loses_no_file(trained: Path, tmp_path: Path) -> None:
+    shutil.copytree(trained, tmp_path, dirs_exist_ok=True)
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    with files_no_longer_than(1000), pytest.raises(FileWriteError, match="too large"):
+        train(tiny_training(tmp_path, resume=True))
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+    fresh = tmp_path / "fresh"
+    with files_no_longer_than(1000), pytest.raises(FileWriteError, match="too large"):
+        train(tiny_training(fresh))
+    assert list(fresh.iterdir()) == []
 
 
 def test_errors_are_relative() -> None:
