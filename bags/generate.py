@@ -5,15 +5,22 @@ The same numbers come out each time; README.md tells what they are.
 
 from __future__ import annotations
 
-import argparse
 import math
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from bag_parts import (
+    RELIABLE,
+    STORY_TOPIC,
+    VEHICLE_STATE_TOPIC,
+    Fault,
+    set_value,
+    shuffle_names,
+    write_bags,
+)
 from geometry_msgs.msg import InertiaStamped
 from nav_msgs.msg import Odometry
 from scipy.spatial.transform import Rotation
@@ -23,7 +30,7 @@ from std_msgs.msg import String
 from dscp_core.plan import PlanStatus
 from dscp_core.planner import Planner, PlannerSettings, TerminalTime
 from dscp_core.simulation import DescentRecord, Replan, simulate_descent
-from dscp_ros.bag import BagWriter, Qos
+from dscp_ros.bag import BagWriter
 from msg_adapters.errors import InputCode
 from msg_adapters.frames import (
     Array,
@@ -42,11 +49,10 @@ from msg_adapters.stamps import (
 from msg_adapters.state import Kinematics, StampedMass, StampedState
 
 NOMINAL, DISPERSED = "powered_descent_nominal", "powered_descent_dispersed"
+IGNITIONS_LOG, IGNITIONS_UNSEEN = "ignitions_log", "ignitions_unseen"
 
 STATE_TOPIC = "/planner/state"
 MASS_TOPIC = "/planner/mass"
-VEHICLE_STATE_TOPIC = "/planner/vehicle_state"
-STORY_TOPIC = "/story"
 
 DISPERSED_START_NS = nanoseconds_from_seconds(datetime(2026, 3, 2, 9, 0, tzinfo=UTC).timestamp())
 NOMINAL_START_NS = nanoseconds_from_seconds(datetime(2026, 3, 2, 9, 10, tzinfo=UTC).timestamp())
@@ -70,7 +76,11 @@ POSITION_CENTRE_M, POSITION_SPREAD_M = (5200.0, 0.0, 0.0), (200.0, 600.0, 600.0)
 VELOCITY_CENTRE_M_S, VELOCITY_SPREAD_M_S = (-135.0, 0.0, 0.0), (15.0, 30.0, 30.0)
 MASS_KG = 38000.0
 
-_RELIABLE = Qos(depth=10, reliability="reliable", durability="volatile")
+IGNITIONS_START_NS = nanoseconds_from_seconds(datetime(2026, 3, 3, 9, 0, tzinfo=UTC).timestamp())
+IGNITIONS_APART_NS = nanoseconds_from_seconds(600.0)
+IGNITIONS_SEEDS = {IGNITIONS_LOG: 21, IGNITIONS_UNSEEN: 22}
+IGNITIONS_STATES = 60
+IGNITIONS_PERIOD_S = 0.2
 
 
 def write_nominal(folder: Path) -> Path:
@@ -78,9 +88,9 @@ def write_nominal(folder: Path) -> Path:
     record = simulate_descent(PlannerSettings(terminal_time=TerminalTime.FREE), seed=NOMINAL_SEED)
     bag = folder / NOMINAL
     with BagWriter(bag, overwrite=True) as writer:
-        writer.add_topic(STORY_TOPIC, String, _RELIABLE)
-        writer.add_topic(MASS_TOPIC, InertiaStamped, _RELIABLE)
-        writer.add_topic(STATE_TOPIC, Odometry, _RELIABLE)
+        writer.add_topic(STORY_TOPIC, String, RELIABLE)
+        writer.add_topic(MASS_TOPIC, InertiaStamped, RELIABLE)
+        writer.add_topic(STATE_TOPIC, Odometry, RELIABLE)
         for entry in sorted(_nominal_entries(record), key=lambda entry: entry.time_ns):
             writer.write(entry.topic, entry.message, entry.time_ns)
     return bag
@@ -145,21 +155,6 @@ def _end_text(record: DescentRecord) -> str:
     )
 
 
-@dataclass(frozen=True)
-class Fault:
-    """What is wrong with a state on purpose.
-
-    Attributes:
-        text: In words.
-        expected: Code by which the planner refuses the state or reports its attempt.
-        spoil: Changes the good state's message.
-    """
-
-    text: str
-    expected: InputCode | PlanStatus
-    spoil: Callable[[JointState], None]
-
-
 def _set_frame(frame: str) -> Callable[[JointState], None]:
     def spoil(message: JointState) -> None:
         message.header.frame_id = frame
@@ -167,17 +162,10 @@ def _set_frame(frame: str) -> Callable[[JointState], None]:
     return spoil
 
 
-def _set_value(name: str, value: float) -> Callable[[JointState], None]:
-    def spoil(message: JointState) -> None:
-        message.position[message.name.index(name)] = value
-
-    return spoil
-
-
 def _set_values(**values: float) -> Callable[[JointState], None]:
     def spoil(message: JointState) -> None:
         for name, value in values.items():
-            _set_value(name, value)(message)
+            set_value(name, value)(message)
 
     return spoil
 
@@ -196,12 +184,12 @@ def _drop_last_value(message: JointState) -> None:
 
 
 FAULTS: dict[int, Fault] = {
-    4: Fault("vz is NaN", InputCode.NOT_FINITE, _set_value("vz", math.nan)),
+    4: Fault("vz is NaN", InputCode.NOT_FINITE, set_value("vz", math.nan)),
     8: Fault("the frame is empty", InputCode.EMPTY_FRAME, _set_frame("")),
     12: Fault("the frame is map", InputCode.WRONG_FRAME, _set_frame("map")),
     16: Fault("six values for seven names", InputCode.WRONG_ARRAY_LENGTH, _drop_last_value),
-    20: Fault("mass is negative", InputCode.MASS_NOT_POSITIVE, _set_value("mass", -MASS_KG)),
-    24: Fault("50 m below ground", InputCode.BELOW_GROUND, _set_value("z", -50.0)),
+    20: Fault("mass is negative", InputCode.MASS_NOT_POSITIVE, set_value("mass", -MASS_KG)),
+    24: Fault("50 m below ground", InputCode.BELOW_GROUND, set_value("z", -50.0)),
     28: Fault("the stamp is 5 s old", InputCode.STALE_STAMP, _shift_stamp(-5.0)),
     32: Fault("the stamp is 5 s ahead", InputCode.FUTURE_STAMP, _shift_stamp(5.0)),
     36: Fault(
@@ -224,22 +212,46 @@ def write_dispersed(folder: Path) -> Path:
     layout = state_layout("powered_descent", Planner(PlannerSettings()).state_names)
     bag = folder / DISPERSED
     with BagWriter(bag, overwrite=True) as writer:
-        writer.add_topic(STORY_TOPIC, String, _RELIABLE)
-        writer.add_topic(VEHICLE_STATE_TOPIC, JointState, _RELIABLE)
         opening = f"{DISPERSED_STATES} unrelated initial states, seed {DISPERSED_SEED}"
-        opening_ns = DISPERSED_START_NS - nanoseconds_from_seconds(LEAD_S)
-        writer.write(STORY_TOPIC, String(data=opening), opening_ns)
+        _open_states(writer, opening, DISPERSED_START_NS)
         for index in range(DISPERSED_STATES):
             stamp_ns = DISPERSED_START_NS + nanoseconds_from_seconds(index * DISPERSED_PERIOD_S)
             message = _random_state(random, layout, stamp_ns)
             text = f"state {index}"
             if (fault := FAULTS.get(index)) is not None:
                 fault.spoil(message)
-                text += f": {fault.text}, expected {fault.expected.name} ({fault.expected:d})"
+                text += f": {fault.announcement}"
             writer.write(STORY_TOPIC, String(data=text), stamp_ns)
             log_ns = stamp_ns + nanoseconds_from_seconds(STATE_LATENCY_S)
             writer.write(VEHICLE_STATE_TOPIC, message, log_ns)
     return bag
+
+
+def write_ignitions(folder: Path) -> list[Path]:
+    """Writes two series of unrelated states, in each of which the engine is lit."""
+    layout = state_layout("powered_descent", Planner(PlannerSettings()).state_names)
+    bags = []
+    for number, (name, seed) in enumerate(IGNITIONS_SEEDS.items()):
+        random = np.random.default_rng(seed)
+        start_ns = IGNITIONS_START_NS + number * IGNITIONS_APART_NS
+        bags.append(folder / name)
+        with BagWriter(bags[-1], overwrite=True) as writer:
+            opening = f"ignition of the engine in {IGNITIONS_STATES} descents, seed {seed}"
+            _open_states(writer, opening, start_ns)
+            for index in range(IGNITIONS_STATES):
+                stamp_ns = start_ns + nanoseconds_from_seconds(index * IGNITIONS_PERIOD_S)
+                log_ns = stamp_ns + nanoseconds_from_seconds(STATE_LATENCY_S)
+                message = _random_state(random, layout, stamp_ns)
+                writer.write(VEHICLE_STATE_TOPIC, message, log_ns)
+    return bags
+
+
+def _open_states(writer: BagWriter, opening: str, start_ns: int) -> None:
+    """Declares the topics of a series of states, and begins the story."""
+    writer.add_topic(STORY_TOPIC, String, RELIABLE)
+    writer.add_topic(VEHICLE_STATE_TOPIC, JointState, RELIABLE)
+    opening_ns = start_ns - nanoseconds_from_seconds(LEAD_S)
+    writer.write(STORY_TOPIC, String(data=opening), opening_ns)
 
 
 def _random_state(random: np.random.Generator, layout: StateLayout, stamp_ns: int) -> JointState:
@@ -248,23 +260,16 @@ def _random_state(random: np.random.Generator, layout: StateLayout, stamp_ns: in
     velocity = random.uniform(-1.0, 1.0, 3) * VELOCITY_SPREAD_M_S + VELOCITY_CENTRE_M_S
     state = StampedState(stamp_ns, np.array([*position, *velocity, MASS_KG]))
     message = joint_state_from_state(state, layout)
-    order = random.permutation(len(message.name))
-    message.name = [message.name[k] for k in order]
-    message.position = [message.position[k] for k in order]
+    shuffle_names(message, random)
     return message
 
 
 def main() -> None:
     """Writes every bag and says how big it is."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument(
-        "--output", type=Path, default=Path(__file__).parent, help="folder (default: this one)"
+    write_bags(
+        __doc__,
+        lambda folder: (write_nominal(folder), write_dispersed(folder), *write_ignitions(folder)),
     )
-    folder = parser.parse_args().output
-    for write in (write_nominal, write_dispersed):
-        bag = write(folder)
-        size = sum(file.stat().st_size for file in bag.iterdir())
-        print(f"{bag}: {size / 1024:.0f} KiB")
 
 
 if __name__ == "__main__":

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from enum import IntEnum
+from enum import Enum, IntEnum
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,18 @@ class PlanStatus(IntEnum):
     DEADLINE = 4
     SOLVER_FAILURE = 5
     INVALID_STATE = 6
+
+
+class TerminalTime(Enum):
+    """Where the terminal time comes from.
+
+    FIXED: the parameter ``terminal_time``, and after the first plan what is left of it. FREE: a
+    decision of the subproblems. PREDICTED: a predictor's, where it knows the state, else FREE.
+    """
+
+    FIXED = "fixed"
+    FREE = "free"
+    PREDICTED = "predicted"
 
 
 @dataclass(frozen=True)
@@ -69,6 +81,8 @@ class PlanOutcome:
         cost: Cost of the plan in the problem's units (powered descent: minus the final mass, kg).
         terminal_time_predicted_s: Prediction of the terminal-time predictor, or None.
         terminal_time_used_s: Terminal time of the plan, or the one that was tried.
+        terminal_time_source: Where that one comes from.
+        terminal_time_reason: Why from there, where the settings name another source; else empty.
         warm_started: Whether the result came from the last plan.
         solver: Backend that answered last.
     """
@@ -85,5 +99,7 @@ class PlanOutcome:
     cost: float
     terminal_time_predicted_s: float | None
     terminal_time_used_s: float
+    terminal_time_source: TerminalTime
+    terminal_time_reason: str
     warm_started: bool
     solver: str

@@ -4,6 +4,8 @@ The landing frame is right-handed with z up. The core's powered descent has x up
 cyclic, hence right-handed too::
 
     ros (x, y, z) = core (y, z, x)        core (x, y, z) = ros (z, x, y)
+
+Entry states are spherical coordinates of a planet-fixed frame; `planet` turns them into its axes.
 """
 
 from __future__ import annotations
@@ -11,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from enum import Enum
 from functools import cached_property
 
 import numpy as np
@@ -21,6 +24,10 @@ from msg_adapters.errors import InputCode, RejectedInputError
 
 LANDING_FRAME = "landing_site"
 """Default landing frame: z up, origin at the touchdown point."""
+
+PLANET_FRAME = "earth"
+"""Default planet-fixed frame (REP 105): origin at the planet's centre, z through the north pole, x
+through longitude zero on the equator."""
 
 BODY_FRAME = "base_link"
 """Default body frame (REP 105)."""
@@ -84,6 +91,15 @@ def quaternion_from_z_axis(direction: Array) -> Array:
     return unit
 
 
+class ControlField(Enum):
+    """Field of a trajectory point that holds the controls, at the states that they act on."""
+
+    EFFORT = "effort"
+    """Forces."""
+    VELOCITIES = "velocities"
+    """Controls that are the rates of these states; ``effort`` stays empty."""
+
+
 @dataclass(frozen=True)
 class StateLayout:
     """How a problem's state vector is named and ordered in messages.
@@ -93,12 +109,14 @@ class StateLayout:
         message_names: Names of the state's entries in messages, in message order.
         core_names: Names of the same quantities in the core, in message order.
         state_names: Names of the core's state vector, in the core's order.
+        control_field: Where trajectories hold the controls.
     """
 
     problem: str
     message_names: tuple[str, ...]
     core_names: tuple[str, ...]
     state_names: tuple[str, ...]
+    control_field: ControlField = ControlField.EFFORT
 
     def __post_init__(self) -> None:
         if sorted(self.core_names) != sorted(self.state_names):
@@ -134,17 +152,36 @@ _POWERED_DESCENT_NAMES = (
 )
 """Pairs of message name (z up) and core name (x up)."""
 
+_ENTRY_NAMES = (
+    ("r", "radius"),
+    ("longitude", "longitude"),
+    ("latitude", "latitude"),
+    ("speed", "speed"),
+    ("flight_path_angle", "flight_path_angle"),
+    ("heading", "heading"),
+    ("angle_of_attack", "angle_of_attack"),
+    ("bank_angle", "bank_angle"),
+)
+"""Pairs of message name and core name."""
+
 POWERED_DESCENT = "powered_descent"
+ENTRY = "entry"
+
+_LAYOUTS = {
+    POWERED_DESCENT: (_POWERED_DESCENT_NAMES, ControlField.EFFORT),
+    ENTRY: (_ENTRY_NAMES, ControlField.VELOCITIES),
+}
 
 
 def state_layout(problem: str, state_names: Sequence[str]) -> StateLayout:
-    """Layout of a problem: that of the landing frame for powered descent, else the core's own.
+    """Layout of a problem; of one that is not known here, the core's own names and order.
 
     Raises:
         InvalidInputError: The state's names are not those of the problem.
     """
     names = tuple(state_names)
-    if problem != POWERED_DESCENT:
+    if problem not in _LAYOUTS:
         return StateLayout(problem, names, names, names)
-    message_names, core_names = zip(*_POWERED_DESCENT_NAMES, strict=True)
-    return StateLayout(problem, tuple(message_names), tuple(core_names), names)
+    pairs, control_field = _LAYOUTS[problem]
+    message_names, core_names = zip(*pairs, strict=True)
+    return StateLayout(problem, tuple(message_names), tuple(core_names), names, control_field)

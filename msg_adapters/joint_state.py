@@ -9,17 +9,9 @@ from sensor_msgs.msg import JointState
 
 from msg_adapters.checks import require_finite, require_frame, require_length, require_names
 from msg_adapters.frames import LANDING_FRAME, StateLayout
+from msg_adapters.limits import default_limits
 from msg_adapters.stamps import nanoseconds_from_stamp, stamp_from_nanoseconds
-from msg_adapters.state import (
-    MASS_NAME,
-    POSITION_NAMES,
-    VELOCITY_NAMES,
-    InputLimits,
-    StampedState,
-    check_mass,
-    check_position,
-    check_velocity,
-)
+from msg_adapters.state import StampedState, StateLimits
 
 
 def state_from_joint_state(
@@ -27,7 +19,7 @@ def state_from_joint_state(
     layout: StateLayout,
     *,
     frame: str = LANDING_FRAME,
-    limits: InputLimits | None = None,
+    limits: StateLimits | None = None,
 ) -> StampedState:
     """State whose entries are ``position[i]`` of ``name[i]``, in any order.
 
@@ -36,14 +28,14 @@ def state_from_joint_state(
             zero or that of ``name``.
         layout: Names and order of the problem's state.
         frame: Expected ``header.frame_id``.
-        limits: Range limits; the defaults of `InputLimits` if None.
+        limits: Range limits; the defaults of the problem if None.
 
     Raises:
         RejectedInputError: NOT_FINITE, EMPTY_FRAME, WRONG_FRAME, WRONG_ARRAY_LENGTH,
             DUPLICATE_NAME, UNKNOWN_NAME, MISSING_NAME, OUT_OF_RANGE, BELOW_GROUND,
             MASS_NOT_POSITIVE or INVALID_STAMP, checked in this order.
     """
-    limits = limits or InputLimits()
+    limits = limits or default_limits(layout.problem)
     require_finite((f"position[{index}]", value) for index, value in enumerate(message.position))
     require_frame("header.frame_id", message.header.frame_id, frame)
     require_length("position", len(message.position), len(message.name))
@@ -51,9 +43,9 @@ def state_from_joint_state(
     require_length("effort", len(message.effort), len(message.name), empty_allowed=True)
     require_names("name", message.name, layout.message_names)
     named = {name: float(v) for name, v in zip(message.name, message.position, strict=True)}
-    _check_ranges(named, limits)
+    admitted = limits.admit(named)
     stamp_ns = nanoseconds_from_stamp(message.header.stamp)
-    ordered = np.array([named[name] for name in layout.message_names], dtype=np.float64)
+    ordered = np.array([admitted[name] for name in layout.message_names], dtype=np.float64)
     return StampedState(stamp_ns, layout.to_core_order(ordered))
 
 
@@ -75,13 +67,3 @@ def joint_state_from_state(
     message.name = list(layout.message_names)
     message.position = array.array("d", ordered.tolist())
     return message
-
-
-def _check_ranges(named: dict[str, float], limits: InputLimits) -> None:
-    """Range checks for those groups of names that the problem has."""
-    if all(name in named for name in POSITION_NAMES):
-        check_position("position", [named[name] for name in POSITION_NAMES], limits)
-    if all(name in named for name in VELOCITY_NAMES):
-        check_velocity("velocity", [named[name] for name in VELOCITY_NAMES], limits)
-    if MASS_NAME in named:
-        check_mass(MASS_NAME, named[MASS_NAME])

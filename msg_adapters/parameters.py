@@ -19,6 +19,12 @@ from msg_adapters.frames import (
 )
 
 
+def follows_message_axes(layout: StateLayout, values: Sequence[float]) -> bool:
+    """Whether a vector parameter has axes, or the state's order."""
+    array = np.asarray(values, dtype=np.float64)
+    return _follows_state(layout, array) or _follows_axes(layout, array)
+
+
 def parameter_to_message_axes(layout: StateLayout, values: Sequence[float]) -> list[float]:
     """Vector parameter from the core's axes and order to those of messages."""
     array = np.asarray(values, dtype=np.float64)

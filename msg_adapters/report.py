@@ -84,6 +84,8 @@ class AttemptFigures:
         terminal_time_used_s: Terminal time of the plan.
         warm_started: Whether it started from the last certified plan.
         solver: Backend that answered last.
+        terminal_time_source: Where the terminal time comes from.
+        terminal_time_reason: Why from there, where the node's settings name another source.
     """
 
     iterations: int
@@ -97,6 +99,8 @@ class AttemptFigures:
     terminal_time_used_s: float | None
     warm_started: bool
     solver: str | None = None
+    terminal_time_source: str | None = None
+    terminal_time_reason: str | None = None
 
 
 @dataclass(frozen=True)
@@ -132,6 +136,7 @@ class PlanReport:
         latency_ms: From the arrival of the input to the publication of the plan, or to the end of
             the attempt.
         mass_source: ``message`` or ``parameter`` where the input itself holds no mass.
+        parameter_set: Parameter sets that an attempt was made with, or ``none``.
         state: State planned from, by the names that messages use.
         attempt: Figures of the attempt, if there was one.
         certificate: The certificate, if there is one.
@@ -150,6 +155,7 @@ class PlanReport:
     input_stamp_ns: int | None = None
     latency_ms: float | None = None
     mass_source: str | None = None
+    parameter_set: str | None = None
     state: Mapping[str, float] = field(default_factory=dict)
     attempt: AttemptFigures | None = None
     certificate: CertificateFigures | None = None
@@ -175,6 +181,8 @@ def attempt_from_outcome(outcome: PlanOutcome, deadline_s: float | None) -> Atte
         terminal_time_used_s=_known(outcome.terminal_time_used_s),
         warm_started=bool(outcome.warm_started),
         solver=outcome.solver or None,
+        terminal_time_source=outcome.terminal_time_source.value,
+        terminal_time_reason=outcome.terminal_time_reason or None,
     )
 
 

@@ -3,10 +3,12 @@
 One status per message. Keys without a known value are left out. Keys:
 
 - always: ``code``, ``code_name``, ``source``, ``published``, ``drops``, ``rejected``
-- if known: ``input_stamp`` (seconds.nanoseconds), ``latency_ms``, ``mass_source``, ``state.NAME``
+- if known: ``input_stamp`` (seconds.nanoseconds), ``latency_ms``, ``mass_source``,
+  ``parameter_set``, ``state.NAME``
 - after an attempt: ``iterations``, ``solve_time_ms``, ``solver_time_ms``, ``deadline_ms``,
   ``virtual_control``, ``max_defect``, ``cost``, ``terminal_time_predicted_s``,
-  ``terminal_time_used_s``, ``warm_started``, ``solver``
+  ``terminal_time_used_s``, ``terminal_time_source``, ``terminal_time_reason``, ``warm_started``,
+  ``solver``
 - with a certificate: ``certificate.passed``, ``certificate.reason.K``,
   ``certificate.miss_position_m``, ``certificate.miss_speed_m_s``, ``certificate.mass_used_kg``,
   ``certificate.check.K.FIELD`` with the fields of `report.CheckFigures`
@@ -101,6 +103,7 @@ def _pairs(report: PlanReport) -> Iterator[tuple[str, Value]]:
         yield "input_stamp", stamp_text(report.input_stamp_ns)
     yield "latency_ms", report.latency_ms
     yield "mass_source", report.mass_source
+    yield "parameter_set", report.parameter_set
     for name, value in report.state.items():
         yield _STATE + name, float(value)
     if report.attempt is not None:
@@ -109,6 +112,8 @@ def _pairs(report: PlanReport) -> Iterator[tuple[str, Value]]:
             yield key, getattr(report.attempt, key)
         yield "warm_started", report.attempt.warm_started
         yield "solver", report.attempt.solver
+        yield "terminal_time_source", report.attempt.terminal_time_source
+        yield "terminal_time_reason", report.attempt.terminal_time_reason
     if report.certificate is not None:
         yield from _certificate_pairs(report.certificate)
     if report.rejection is not None:
@@ -155,6 +160,7 @@ def report_from_message(message: DiagnosticArray) -> PlanReport:
         input_stamp_ns=_input_stamp_ns(reader),
         latency_ms=reader.optional_number("latency_ms"),
         mass_source=reader.optional_text("mass_source"),
+        parameter_set=reader.optional_text("parameter_set"),
         state=_state(reader),
         attempt=_attempt(reader),
         certificate=_certificate(reader),
@@ -190,6 +196,8 @@ def _attempt(reader: KeyValueReader) -> AttemptFigures | None:
         iterations=reader.integer("iterations"),
         warm_started=reader.boolean("warm_started"),
         solver=reader.optional_text("solver"),
+        terminal_time_source=reader.optional_text("terminal_time_source"),
+        terminal_time_reason=reader.optional_text("terminal_time_reason"),
         **{key: reader.optional_number(key) for key in _NUMBERS},
     )
 

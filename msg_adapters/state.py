@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
@@ -16,9 +17,21 @@ VELOCITY_NAMES = ("vx", "vy", "vz")
 MASS_NAME = "mass"
 
 
+class StateLimits(Protocol):
+    """What the named scalars of a problem's state have to satisfy."""
+
+    def admit(self, named: Mapping[str, float]) -> dict[str, float]:
+        """Finite named scalars as the planner takes them, which may be the same in other numbers.
+
+        Raises:
+            RejectedInputError: A value is out of range.
+        """
+        ...
+
+
 @dataclass(frozen=True)
 class InputLimits:
-    """Bounds beyond which a state is taken for an error.
+    """Bounds beyond which the state of a landing vehicle is taken for an error.
 
     Attributes:
         position_max_m: Largest distance from the landing site.
@@ -29,6 +42,20 @@ class InputLimits:
     position_max_m: float = 1e6
     speed_max_m_s: float = 1e4
     ground_tolerance_m: float = 1.0
+
+    def admit(self, named: Mapping[str, float]) -> dict[str, float]:
+        """The same scalars, after range checks of those groups of names that are there.
+
+        Raises:
+            RejectedInputError: OUT_OF_RANGE, BELOW_GROUND or MASS_NOT_POSITIVE.
+        """
+        if all(name in named for name in POSITION_NAMES):
+            check_position("position", [named[name] for name in POSITION_NAMES], self)
+        if all(name in named for name in VELOCITY_NAMES):
+            check_velocity("velocity", [named[name] for name in VELOCITY_NAMES], self)
+        if MASS_NAME in named:
+            check_mass(MASS_NAME, named[MASS_NAME])
+        return dict(named)
 
 
 @dataclass(frozen=True)

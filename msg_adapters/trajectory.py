@@ -1,9 +1,11 @@
 """trajectory_msgs/JointTrajectory: a plan as a trajectory of named scalars.
 
-Per point, in message order: ``positions`` are the states, ``velocities`` their rates of change,
-``effort`` the control components at the states they act on (for powered descent the thrust in
-newtons at vx, vy, vz) and zero elsewhere. ``accelerations`` stay empty. The header's stamp is that
-of the state the plan starts from, so ``time_from_start`` counts from there.
+Per point, in message order: ``positions`` are the states, ``velocities`` their rates of change.
+Controls stand at the states they act on. Forces are in ``effort``, zero elsewhere (for powered
+descent the thrust in newtons at vx, vy, vz). Controls that are rates of states (for entry those of
+angle_of_attack and bank_angle in rad/s) are what ``velocities`` holds for these states, and
+``effort`` stays empty. So do ``accelerations``. The header's stamp is that of the state the plan
+starts from, so ``time_from_start`` counts from there.
 """
 
 from __future__ import annotations
@@ -17,7 +19,7 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from msg_adapters.checks import require_finite, require_frame, require_length, require_names
 from msg_adapters.errors import InputCode, RejectedInputError
-from msg_adapters.frames import LANDING_FRAME, Array, StateLayout
+from msg_adapters.frames import LANDING_FRAME, Array, ControlField, StateLayout
 from msg_adapters.stamps import (
     duration_from_nanoseconds,
     nanoseconds_from_duration,
@@ -47,21 +49,20 @@ class TrajectoryEncoder:
             frame: ``header.frame_id``.
         """
         self._layout = layout
+        self._fields = _fields(layout)
         size = len(layout.message_names)
         self._message = JointTrajectory()
         self._message.header.frame_id = frame
         self._message.joint_names = list(layout.message_names)
         self._message.points = [
             JointTrajectoryPoint(
-                positions=array.array("d", bytes(8 * size)),
-                velocities=array.array("d", bytes(8 * size)),
-                effort=array.array("d", bytes(8 * size)),
+                **{field: array.array("d", bytes(8 * size)) for field in self._fields}
             )
             for _ in range(nodes)
         ]
-        # Views of the message's own buffers, one row of three per point.
+        # Views of the message's own buffers, one row of fields per point.
         self._views = [
-            tuple(np.frombuffer(a, dtype=np.float64) for a in (p.positions, p.velocities, p.effort))
+            tuple(np.frombuffer(getattr(p, f), dtype=np.float64) for f in self._fields)
             for p in self._message.points
         ]
 
@@ -81,8 +82,6 @@ class TrajectoryEncoder:
             RejectedInputError: WRONG_ARRAY_LENGTH, or NOT_FINITE for any number of the plan.
         """
         require_length("plan.times_s", len(plan.times_s), self.nodes)
-        effort = np.zeros_like(plan.states)
-        effort[:, list(plan.control_states)] = plan.controls
         for field, block in (
             ("times_s", plan.times_s),
             ("states", plan.states),
@@ -94,10 +93,13 @@ class TrajectoryEncoder:
                     InputCode.NOT_FINITE, f"plan.{field}", "NaN or infinity", "finite"
                 )
         self._message.header.stamp = stamp_from_nanoseconds(stamp_ns)
-        blocks = [
-            self._layout.to_message_order(block)
-            for block in (plan.states, plan.state_rates, effort)
-        ]
+        contents = {
+            "positions": plan.states,
+            "velocities": plan.state_rates.copy(),
+            "effort": np.zeros_like(plan.states),
+        }
+        contents[self._layout.control_field.value][:, list(plan.control_states)] = plan.controls
+        blocks = [self._layout.to_message_order(contents[field]) for field in self._fields]
         for k, (point, views) in enumerate(zip(self._message.points, self._views, strict=True)):
             for view, block in zip(views, blocks, strict=True):
                 view[:] = block[k]
@@ -152,9 +154,11 @@ def plan_from_trajectory(
     require_frame("header.frame_id", message.header.frame_id, frame)
     require_names("joint_names", message.joint_names, layout.message_names)
     size = len(layout.message_names)
+    filled = _fields(layout)
     for k, point in enumerate(message.points):
         for field in ("positions", "velocities", "effort"):
-            require_length(f"points[{k}].{field}", len(getattr(point, field)), size)
+            expected = size if field in filled else 0
+            require_length(f"points[{k}].{field}", len(getattr(point, field)), expected)
     times_s = _times_s(message)
     stamp_ns = nanoseconds_from_stamp(message.header.stamp)
 
@@ -171,11 +175,17 @@ def plan_from_trajectory(
         control_states=tuple(control_states),
         times_s=times_s,
         states=in_core_order("positions"),
-        controls=in_core_order("effort")[:, list(control_states)],
+        controls=in_core_order(layout.control_field.value)[:, list(control_states)],
         state_rates=in_core_order("velocities"),
         terminal_time_s=float(times_s[-1]),
     )
     return plan, stamp_ns
+
+
+def _fields(layout: StateLayout) -> tuple[str, ...]:
+    """Fields of a point that hold numbers."""
+    with_forces = layout.control_field is ControlField.EFFORT
+    return ("positions", "velocities", "effort") if with_forces else ("positions", "velocities")
 
 
 def _times_s(message: JointTrajectory) -> Array:

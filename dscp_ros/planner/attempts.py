@@ -173,6 +173,7 @@ class AttemptRunner:
             input_stamp_ns=state.stamp_ns,
             latency_ms=latency_ms,
             mass_source=job.accepted.mass_source,
+            parameter_set=self._session.parameter_set,
             state={name: float(value) for name, value in named},
             attempt=attempt,
             certificate=certificate,

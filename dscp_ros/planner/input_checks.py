@@ -23,7 +23,13 @@ from msg_adapters.stamps import (
     seconds_from_nanoseconds,
     stamp_text,
 )
-from msg_adapters.state import InputLimits, StampedMass, StampedState, state_from_kinematics
+from msg_adapters.state import (
+    InputLimits,
+    StampedMass,
+    StampedState,
+    StateLimits,
+    state_from_kinematics,
+)
 
 FROM_MESSAGE = "message"
 FROM_PARAMETER = "parameter"
@@ -34,7 +40,7 @@ class InputSettings:
     """What inputs have to satisfy.
 
     Attributes:
-        frame: Landing frame.
+        frame: Frame of states.
         state_max_age_s: Largest age of a state.
         mass_max_age_s: Largest age of a mass message when a state needs it.
         future_tolerance_s: How far a stamp may be ahead of the clock.
@@ -47,7 +53,7 @@ class InputSettings:
     mass_max_age_s: float = 2.0
     future_tolerance_s: float = 0.1
     mass_fallback_kg: float = 0.0
-    limits: InputLimits = InputLimits()  # noqa: RUF009 - frozen
+    limits: StateLimits = InputLimits()  # noqa: RUF009 - frozen
 
 
 @dataclass(frozen=True)
@@ -91,7 +97,9 @@ class InputGate:
         Raises:
             RejectedInputError: Any code of 1xx to 7xx.
         """
-        kinematics = kinematics_from_odometry(message, frame=settings.frame, limits=settings.limits)
+        limits = settings.limits
+        assert isinstance(limits, InputLimits)  # the node listens to odometry of landings only
+        kinematics = kinematics_from_odometry(message, frame=settings.frame, limits=limits)
         self._check_time("header.stamp", kinematics.stamp_ns, now_ns, settings)
         mass_kg, source = self._mass_at(kinematics.stamp_ns, settings)
         self._last_state_ns = kinematics.stamp_ns

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from types import FrameType
 from typing import TYPE_CHECKING, Any
 
-from dscp_core.errors import InvalidInputError
+from dscp_core.errors import DscpError, InvalidInputError
 from dscp_ros.cli import ExitCode
 
 if TYPE_CHECKING:
@@ -28,6 +28,8 @@ Run the planner as a ROS 2 node (default name: /planner).
 in   ~/state          nav_msgs/Odometry            position, velocity (twist in the child frame)
      ~/mass           geometry_msgs/InertiaStamped mass that completes ~/state
      ~/vehicle_state  sensor_msgs/JointState       or: x y z vx vy vz mass in one message
+                      (entry: this only, with r longitude latitude speed flight_path_angle heading
+                      angle_of_attack bank_angle)
 out  ~/trajectory     trajectory_msgs/JointTrajectory   certified plans only
      ~/path           nav_msgs/Path
      ~/markers        visualization_msgs/MarkerArray
@@ -40,6 +42,7 @@ EPILOG = """\
 examples:
   dscp planner
   dscp planner --params-file config/powered_descent.yaml
+  dscp planner --params-file config/entry.yaml
   dscp planner --ros-args -p deadline_s:=0.1 -r '~/state:=/vehicle/odometry'
 
 exit codes: 0 ended by SIGINT or SIGTERM, 2 bad arguments or parameters.
@@ -95,7 +98,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     add_arguments(parser)
     try:
         return run(ros_arguments(parser.parse_args(argv)))
-    except InvalidInputError as error:
+    except DscpError as error:
         print(f"{NODE_NAME}: error: {error}", file=sys.stderr)
         return ExitCode.BAD_INPUT
 

@@ -25,16 +25,17 @@ from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
 from dscp_core.errors import DscpError
-from dscp_core.planner import PlannerSettings
+from dscp_core.planner import Planner
 from dscp_ros.planner.attempts import AttemptRunner, PlanJob, Surroundings
 from dscp_ros.planner.events import ThrottledLog, event_report, refusal_report
 from dscp_ros.planner.health import HealthMonitor
 from dscp_ros.planner.input_checks import FROM_PARAMETER, AcceptedState, InputGate, InputSettings
+from dscp_ros.planner.interfaces import interface_of
 from dscp_ros.planner.outputs import PlanOutputs
 from dscp_ros.planner.parameter_files import ParameterArguments
-from dscp_ros.planner.parameter_server import ParameterServer
+from dscp_ros.planner.parameter_server import FileChange, ParameterServer
 from dscp_ros.planner.parameters import RELIABLE, NodeSettings, problem_layout
-from dscp_ros.planner.session import PlanningSession
+from dscp_ros.planner.session import PlannerSetup, PlanningSession
 from dscp_ros.planner.worker import MailboxWorker
 from msg_adapters.errors import InputCode, RejectedInputError
 from msg_adapters.report import NodeCode, PlanReport
@@ -65,8 +66,8 @@ class PlannerNode:
         settings = self._parameters.settings
         layout = problem_layout(self._parameters.problem)
         self._problem = layout.problem
-        self._session = PlanningSession(settings.planner)
-        self._requested: PlannerSettings | None = settings.planner
+        self._session = PlanningSession(self._parameters.setup)
+        self._requested: PlannerSetup | None = self._parameters.setup
         self._gate = InputGate(layout)
         self._health = HealthMonitor()
         self._warnings = ThrottledLog(node.get_logger().warning)
@@ -88,7 +89,9 @@ class PlannerNode:
         self._open(settings)
         node.get_logger().info(
             f"planning {self._problem} with {settings.planner.options.solver}, "
-            f"{settings.planner.intervals} intervals, from states in {settings.inputs.frame}"
+            f"{settings.planner.intervals} intervals, from states in {settings.inputs.frame}, "
+            f"{settings.planner.terminal_time.value} terminal time, "
+            f"parameter set {self._parameters.setup.parameter_set}"
         )
 
     def close(self, timeout_s: float) -> bool:
@@ -118,8 +121,9 @@ class PlannerNode:
         )
         newest = QoSProfile(depth=1, reliability=reliability)
         few = QoSProfile(depth=_MASS_DEPTH, reliability=reliability)
-        node.create_subscription(Odometry, "~/state", self._on_state, newest)
-        node.create_subscription(InertiaStamped, "~/mass", self._on_mass, few)
+        if interface_of(self._problem).odometry:
+            node.create_subscription(Odometry, "~/state", self._on_state, newest)
+            node.create_subscription(InertiaStamped, "~/mass", self._on_mass, few)
         node.create_subscription(JointState, "~/vehicle_state", self._on_vehicle_state, newest)
         # Services wait for the worker; in a group of their own they hold up nothing else.
         group = ReentrantCallbackGroup()
@@ -204,7 +208,7 @@ class PlannerNode:
     def _fresh_state(self) -> AcceptedState:
         if self._last is None:
             raise RejectedInputError(
-                InputCode.STATE_MISSING, "state", None, "a state on ~/state or ~/vehicle_state"
+                InputCode.STATE_MISSING, "state", None, "a state on one of the input topics"
             )
         inputs = self._parameters.settings.inputs
         self._gate.check_still_fresh(self._last.state, self._now_ns(), inputs)
@@ -223,17 +227,38 @@ class PlannerNode:
         """Read the parameter files again and rebuild the planner; on failure keep the old one."""
         try:
             change = self._parameters.reread_files()
-            planner = change.settings.planner
-            rebuilt = self._worker.call(lambda: self._rebuild(planner))
-            await self._finished(rebuilt)
-            rebuilt.result()
-            self._requested = planner
-            self._parameters.commit(change)
+            built = self._worker.call(change.setup.planner)
+            await self._finished(built)
+            planner = built.result()
+            self._commit(change)
+            setup = self._parameters.setup
+            installed = self._worker.call(lambda: self._install(setup, planner, change.setup))
+            await self._finished(installed)
+            installed.result()
         except (DscpError, CancelledError) as error:
             self._node.get_logger().error(f"reload refused: {error}")
             return _answer(response, False, f"the old parameters stay: {error}")
         self._health.note_configuration(None)
-        return _answer(response, True, f"{len(change.values)} parameters read, planner rebuilt")
+        done = f"{len(change.values)} parameters read, planner rebuilt"
+        self._node.get_logger().info(f"{done}, parameter set {setup.parameter_set}")
+        return _answer(response, True, f"{done}; parameter set: {setup.parameter_set}")
+
+    def _commit(self, change: FileChange) -> None:
+        """Take the parameters over; their planner is there already."""
+        before, self._requested = self._requested, change.setup
+        try:
+            self._parameters.commit(change)
+        except DscpError:
+            self._requested = before
+            raise
+
+    def _install(self, setup: PlannerSetup, planner: Planner, built_of: PlannerSetup) -> None:
+        """Swap the planner between two attempts, unless a parameter has changed meanwhile."""
+        if setup.plans_like(built_of):
+            self._session.install(setup, planner)
+            self._outputs.clear_drawing(self._now_ns())
+        else:
+            self._change(setup)
 
     async def _finished(self, future: Future[Any]) -> None:
         """Let the executor go on until a future of the worker is settled."""
@@ -250,25 +275,28 @@ class PlannerNode:
 
     # Parameters, clock, health
 
-    def _on_settings(self, settings: NodeSettings) -> None:
+    def _on_settings(self) -> None:
         """Rebuild the planner where a changed parameter concerns it."""
-        if settings.planner == self._requested:
+        setup = self._parameters.setup
+        if setup == self._requested:
             return
-        self._requested = settings.planner
-        rebuilt = self._worker.call(lambda: self._rebuild(settings.planner))
-        rebuilt.add_done_callback(self._note_rebuild)
+        self._requested = setup
+        self._worker.call(lambda: self._change(setup)).add_done_callback(self._note_rebuild)
 
-    def _rebuild(self, settings: PlannerSettings) -> None:
-        self._session.rebuild(settings)
-        # A plan with fewer intervals would leave thrust arrows of the old one standing.
-        self._outputs.clear_drawing(self._now_ns())
+    def _change(self, setup: PlannerSetup) -> bool:
+        rebuilt = self._session.change(setup)
+        if rebuilt:
+            # A plan with fewer intervals would leave thrust arrows of the old one standing.
+            self._outputs.clear_drawing(self._now_ns())
+        return rebuilt
 
     def _note_rebuild(self, rebuilt: Future[Any]) -> None:
         if rebuilt.cancelled():
             return
         error = rebuilt.exception()
         if error is None:
-            self._node.get_logger().info("planner rebuilt with the new parameters")
+            if rebuilt.result():
+                self._node.get_logger().info("planner rebuilt with the new parameters")
             self._health.note_configuration(None)
             return
         self._requested = None

@@ -11,16 +11,11 @@ from visualization_msgs.msg import MarkerArray
 
 from dscp_core.plan import Plan
 from msg_adapters.diagnostics import Health, message_from_health
+from msg_adapters.drawing import Drawing, no_markers
 from msg_adapters.frames import StateLayout
 from msg_adapters.report import PlanReport
 from msg_adapters.report_message import message_from_report
 from msg_adapters.trajectory import TrajectoryEncoder
-from msg_adapters.visualisation import (
-    MarkerStyle,
-    markers_from_plan,
-    no_markers,
-    path_from_plan,
-)
 
 _REPORT_DEPTH = 50
 """Reports kept for late and slow subscribers: every attempt has its report, in bursts too."""
@@ -67,14 +62,14 @@ class PlanOutputs:
             self._encoder = TrajectoryEncoder(self._layout, nodes, frame=self._frame)
         self._trajectory.publish(self._encoder.encode(plan, stamp_ns))
 
-    def publish_drawing(self, plan: Plan, stamp_ns: int, style: MarkerStyle) -> None:
+    def publish_drawing(self, plan: Plan, stamp_ns: int, drawing: Drawing) -> None:
         """Publish what people look at.
 
         Raises:
             RejectedInputError: The plan holds NaN; nothing is published.
         """
-        path = path_from_plan(plan, stamp_ns, frame=self._frame)
-        markers = markers_from_plan(plan, stamp_ns, style, frame=self._frame)
+        path = drawing.path(plan, stamp_ns, frame=self._frame)
+        markers = drawing.markers(plan, stamp_ns, frame=self._frame)
         self._path.publish(path)
         self._markers.publish(markers)
 

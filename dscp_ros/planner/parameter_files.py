@@ -138,10 +138,21 @@ def read_parameters(arguments: ParameterArguments, node_name: str) -> dict[str, 
     """
     values: dict[str, Any] = {}
     for path in arguments.files:
-        for section, parameters in _sections(path):
-            if _matches(section, node_name):
-                values.update(_flatten(parameters))
+        values.update(read_file(path, node_name))
     return {name: value for name, value in values.items() if name not in arguments.names}
+
+
+def read_file(path: str, node_name: str) -> dict[str, Any]:
+    """Parameter values of a node in one file.
+
+    Raises:
+        InvalidInputError: The file is missing, no YAML, or no parameter file.
+    """
+    values: dict[str, Any] = {}
+    for section, parameters in _sections(path):
+        if _matches(section, node_name):
+            values.update(_flatten(parameters))
+    return values
 
 
 def _sections(path: str) -> Iterator[tuple[str, Mapping[str, Any]]]:

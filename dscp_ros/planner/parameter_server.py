@@ -16,21 +16,25 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from dscp_core import problems
-from dscp_core.errors import InvalidInputError
+from dscp_core.errors import DscpError, InvalidInputError
+from dscp_core.planner import TerminalTime
+from dscp_ros.planner.declaration import NodeParameter
 from dscp_ros.planner.parameter_files import (
     ParameterArguments,
     check_node_names,
     check_parameter_names,
-    read_parameters,
 )
+from dscp_ros.planner.parameter_sources import ParameterSources, read_sources
 from dscp_ros.planner.parameters import (
+    NETWORK,
     PROBLEM,
-    NodeParameter,
     NodeSettings,
     formulation_parameter,
     node_settings,
     parameter_table,
 )
+from dscp_ros.planner.predictors import Predictors
+from dscp_ros.planner.session import PlannerSetup
 
 
 @dataclass(frozen=True)
@@ -38,12 +42,22 @@ class FileChange:
     """Content of the parameter files, checked but not taken over.
 
     Attributes:
-        settings: Settings that would result.
+        setup: What the planner would be made of.
         values: Values that would be set.
+        origin: Where they come from.
     """
 
-    settings: NodeSettings
+    setup: PlannerSetup
     values: Mapping[str, Any]
+    origin: _Origin
+
+
+@dataclass(frozen=True)
+class _Origin:
+    """What was read of the files, and of the networks that they name."""
+
+    sources: ParameterSources
+    predictors: Predictors
 
 
 class ParameterServer:
@@ -52,6 +66,7 @@ class ParameterServer:
     Attributes:
         problem: Declaration of the problem that the parameters chose.
         settings: Settings of the current values; replaced as a whole when a value changes.
+        setup: What the planner is made of by these settings; likewise.
     """
 
     def __init__(self, node: Node, arguments: ParameterArguments) -> None:
@@ -63,6 +78,8 @@ class ParameterServer:
 
         Raises:
             InvalidInputError: A misspelt node or parameter name, or a bad value.
+            ParameterSetError: A file's parameter set is damaged, or of another vehicle.
+            NetworkFileError: The terminal-time network is damaged.
         """
         self._node = node
         self._arguments = arguments
@@ -77,13 +94,15 @@ class ParameterServer:
         # that are not declared.
         given: Mapping[str, Any] = node._parameter_overrides
         check_parameter_names(list(given), list(node.get_parameters_by_prefix("")))
-        self.settings = self._settings_of(self._values())
-        self._on_change: Callable[[NodeSettings], None] | None = None
+        self._origin = self._read()
+        self._take_over(self._values())
+        self._origin.sources.check_vehicle(self._vehicle(self.settings))
+        self._on_change: Callable[[], None] | None = None
         node.add_on_set_parameters_callback(self._validate)
         node.add_post_set_parameters_callback(self._apply)
 
-    def on_change(self, callback: Callable[[NodeSettings], None]) -> None:
-        """Call back with the new settings whenever a parameter has changed."""
+    def on_change(self, callback: Callable[[], None]) -> None:
+        """Call back whenever a parameter has changed."""
         self._on_change = callback
 
     def reread_files(self) -> FileChange:
@@ -91,34 +110,59 @@ class ParameterServer:
 
         Raises:
             InvalidInputError: A file or value is bad, or it changes a read-only parameter.
+            ParameterSetError: A file's parameter set is damaged, or of another vehicle.
+            NetworkFileError: The terminal-time network is damaged.
         """
-        given = read_parameters(self._arguments, self._node.get_fully_qualified_name())
+        origin = self._read()
+        given = origin.sources.values
         check_parameter_names(list(given), list(self._node.get_parameters_by_prefix("")))
         current = self._values()
         read = {name: value for name, value in given.items() if name in self._table}
         for name, value in read.items():
             parameter = self._table[name]
-            _check_type(parameter, value)
+            parameter.check_type(value)
             if parameter.read_only and value != current[name]:
                 raise InvalidInputError(name, value, f"read-only, {current[name]!r}: restart")
+        read |= self._dropped(given, current)
+        values = self._merged(read)
+        settings = self._settings_of(values)
+        origin.sources.check_vehicle(self._vehicle(settings))
         return FileChange(
-            settings=self._settings_of(self._merged(read)),
+            setup=self._setup_of(settings, values, origin),
             values={n: v for n, v in read.items() if not self._table[n].read_only},
+            origin=origin,
         )
 
     def commit(self, change: FileChange) -> None:
         """Take over what the parameter files hold.
 
         Raises:
-            InvalidInputError: A parameter was refused after all.
+            InvalidInputError: A parameter was refused after all; everything stays as it was.
         """
-        if not change.values:
-            return
+        before, self._origin = self._origin, change.origin
         result = self._node.set_parameters_atomically(
             [Parameter(name, value=value) for name, value in change.values.items()]
         )
         if not result.successful:
+            self._origin = before
             raise InvalidInputError("parameter files", self._arguments.files, result.reason)
+        self._take_over(self._values())
+
+    def _dropped(self, given: Mapping[str, Any], current: Mapping[str, Any]) -> dict[str, Any]:
+        """Defaults of what the files gave and give no more; what was set otherwise stays."""
+        before = self._origin.sources.values
+        return {
+            name: _plain(parameter.default)
+            for name, parameter in self._table.items()
+            if not parameter.read_only
+            and name in before
+            and name not in given
+            and current[name] == _plain(before[name])
+        }
+
+    def _read(self) -> _Origin:
+        sources = read_sources(self._arguments, self._node.get_fully_qualified_name())
+        return _Origin(sources, Predictors(self.problem.name, sources.network))
 
     def _declare(self, parameter: NodeParameter) -> Any:
         """Declare one parameter and return its checked value."""
@@ -127,7 +171,7 @@ class ParameterServer:
             value = _plain(self._node.get_parameter(parameter.name).value)
         except InvalidParameterTypeException as error:
             given = self._node._parameter_overrides[parameter.name].value
-            raise InvalidInputError(parameter.name, given, _type_text(parameter)) from error
+            raise InvalidInputError(parameter.name, given, parameter.type_text) from error
         except InvalidParameterValueException as error:
             given = self._node._parameter_overrides[parameter.name].value
             bound = f"[{parameter.lower:g}, {parameter.upper:g}] {parameter.unit}".rstrip()
@@ -155,46 +199,45 @@ class ParameterServer:
     def _settings_of(self, values: Mapping[str, Any]) -> NodeSettings:
         return node_settings(self.problem, self._formulation, values)
 
+    def _setup_of(
+        self, settings: NodeSettings, values: Mapping[str, Any], origin: _Origin
+    ) -> PlannerSetup:
+        """What the planner is made of.
+
+        Raises:
+            InvalidInputError: The network is missing, or of another vehicle.
+            NetworkFileError: It is damaged.
+        """
+        vehicle = self._vehicle(settings)
+        predictor = None
+        if settings.planner.terminal_time is TerminalTime.PREDICTED:
+            predictor = origin.predictors.predictor(values[NETWORK], vehicle)
+        return PlannerSetup(settings.planner, predictor, origin.sources.label(values, vehicle))
+
+    def _vehicle(self, settings: NodeSettings) -> dict[str, Any]:
+        """Every parameter of the problem by name, SI, in the core's axes."""
+        return dict(self.problem.table.unpack(self.problem.pack(settings.planner.parameters)))
+
+    def _take_over(self, values: Mapping[str, Any]) -> None:
+        settings = self._settings_of(values)
+        self.setup = self._setup_of(settings, values, self._origin)
+        self.settings = settings
+
     def _validate(self, changes: Sequence[Parameter]) -> SetParametersResult:
         """Accept or refuse a set of changes as a whole; the reason names the parameter."""
         try:
-            self._settings_of(self._merged({p.name: p.value for p in changes}))
-        except InvalidInputError as error:
+            values = self._merged({p.name: p.value for p in changes})
+            self._setup_of(self._settings_of(values), values, self._origin)
+        except DscpError as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
 
     def _apply(self, _changes: Sequence[Parameter]) -> None:
-        self.settings = self._settings_of(self._values())
+        self._take_over(self._values())
         if self._on_change is not None:
-            self._on_change(self.settings)
-
-
-def _check_type(parameter: NodeParameter, value: Any) -> None:
-    """Check a YAML value's type as rcl does at the start.
-
-    Raises:
-        InvalidInputError: The type is not that of the default.
-    """
-    same = type(value) is type(parameter.default)
-    if isinstance(value, list):
-        same = same and all(type(item) is float for item in value)
-    if not same:
-        raise InvalidInputError(parameter.name, value, _type_text(parameter))
+            self._on_change()
 
 
 def _plain(value: Any) -> Any:
     """Python numbers and lists in place of the arrays that rclpy returns."""
     return value if isinstance(value, str | bool | int | float | None) else list(value)
-
-
-def _type_text(parameter: NodeParameter) -> str:
-    default = parameter.default
-    if isinstance(default, bool):
-        return "true or false"
-    if isinstance(default, int):
-        return "a whole number"
-    if isinstance(default, float):
-        return "a number with a point, such as 1.0"
-    if isinstance(default, str):
-        return "a text"
-    return f"{len(default)} numbers, each with a point, such as 1.0"

@@ -6,13 +6,9 @@ code here, and another vehicle is a YAML file.
 
 from __future__ import annotations
 
-import math
-import sys
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from typing import Any
-
-from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 
 from dscp_core import problems
 from dscp_core.errors import InvalidInputError
@@ -20,16 +16,22 @@ from dscp_core.ocp import OptimalControlProblem
 from dscp_core.planner import PlannerSettings, TerminalTime
 from dscp_core.scp import ScpOptions
 from dscp_core.solvers import SOLVER_NAMES
+from dscp_core.terminal_time import DEFAULT_NETWORK
 from dscp_core.verification import ControlHold
+from dscp_ros.planner.declaration import NodeParameter, Value
 from dscp_ros.planner.input_checks import InputSettings
-from msg_adapters.frames import LANDING_FRAME, StateLayout, state_layout
-from msg_adapters.parameters import parameter_to_core_axes, parameter_to_message_axes
-from msg_adapters.state import InputLimits
-from msg_adapters.visualisation import MarkerStyle
+from dscp_ros.planner.interfaces import VEHICLE_PREFIX, interface_of
+from msg_adapters.drawing import Drawing
+from msg_adapters.frames import StateLayout, state_layout
+from msg_adapters.parameters import (
+    follows_message_axes,
+    parameter_to_core_axes,
+    parameter_to_message_axes,
+)
 
-Value = bool | int | float | str | Sequence[float]
-
-VEHICLE_PREFIX = "parameters."
+NETWORK = "terminal_time_network"
+SHIPPED_NETWORKS = {"powered_descent": DEFAULT_NETWORK}
+"""Network of each problem's default vehicle, where there is one."""
 RELIABLE = "reliable"
 BEST_EFFORT = "best_effort"
 
@@ -37,86 +39,6 @@ _OPTIONS = ScpOptions()
 _COST_TOLERANCE = 1e-6
 """Looser than the core's: 0.03 kg of the paper's rocket, for which a late plan is no fair price."""
 _INPUTS = InputSettings()
-_LIMITS = InputLimits()
-
-
-@dataclass(frozen=True)
-class NodeParameter:
-    """Declaration of one parameter.
-
-    Attributes:
-        name: Name.
-        default: Default value, which also fixes the type and, of a list, the length.
-        description: What it is.
-        unit: SI unit, or empty.
-        lower: Least value of a number, or of every component of a list.
-        upper: Greatest value.
-        choices: Permitted texts; empty for any.
-        read_only: Whether it can be set at the start only.
-    """
-
-    name: str
-    default: Value
-    description: str
-    unit: str = ""
-    lower: float = -math.inf
-    upper: float = math.inf
-    choices: tuple[str, ...] = ()
-    read_only: bool = False
-
-    def descriptor(self) -> ParameterDescriptor:
-        """Descriptor with range and constraints."""
-        unit = f" [{self.unit}]" if self.unit else ""
-        descriptor = ParameterDescriptor(
-            description=self.description + unit, read_only=self.read_only
-        )
-        if self.choices:
-            descriptor.additional_constraints = f"one of {', '.join(self.choices)}"
-        elif isinstance(self.default, int):
-            descriptor.integer_range = [
-                IntegerRange(from_value=int(self.lower), to_value=int(self.upper), step=0)
-            ]
-        elif isinstance(self.default, float):
-            largest = sys.float_info.max
-            descriptor.floating_point_range = [
-                FloatingPointRange(
-                    from_value=max(self.lower, -largest), to_value=min(self.upper, largest)
-                )
-            ]
-        elif not isinstance(self.default, str):
-            descriptor.additional_constraints = (
-                f"{len(self.default)} numbers in [{self.lower:g}, {self.upper:g}]"
-            )
-        return descriptor
-
-    def check(self, value: Any) -> None:
-        """Check a value beyond what a descriptor can say: NaN, list length, choices.
-
-        Raises:
-            InvalidInputError: The value is out of bounds.
-        """
-        if self.choices:
-            if value not in self.choices:
-                raise InvalidInputError(self.name, value, f"one of {', '.join(self.choices)}")
-            return
-        if isinstance(self.default, str):
-            if not value:
-                raise InvalidInputError(self.name, value, "a text that is not empty")
-            return
-        if isinstance(self.default, int | float):
-            components = [value]
-        else:
-            components = [] if value is None else list(value)
-            if len(components) != len(self.default):
-                raise InvalidInputError(
-                    self.name, components, f"{len(self.default)} numbers, each with a point"
-                )
-        for component in components:
-            if not math.isfinite(component):
-                raise InvalidInputError(self.name, value, "finite")
-            if not self.lower <= component <= self.upper:
-                bound = f"[{self.lower:g}, {self.upper:g}] {self.unit}".rstrip()
-                raise InvalidInputError(self.name, value, bound)
 
 
 @dataclass(frozen=True)
@@ -128,7 +50,7 @@ class NodeSettings:
         inputs: What inputs have to satisfy.
         deadline_s: Wall time of one plan.
         state_reliability: Reliability that the state subscriptions ask for.
-        markers: Sizes of the markers.
+        markers: How plans are drawn.
         log_period_s: Least time between two log lines of the same cause.
     """
 
@@ -136,7 +58,7 @@ class NodeSettings:
     inputs: InputSettings
     deadline_s: float
     state_reliability: str
-    markers: MarkerStyle
+    markers: Drawing
     log_period_s: float
 
 
@@ -164,7 +86,17 @@ def problem_layout(problem: OptimalControlProblem) -> StateLayout:
 
 def parameter_table(problem: OptimalControlProblem) -> tuple[NodeParameter, ...]:
     """Every parameter but the problem and its formulation."""
-    return (*_NODE, *_PLANNING, *_vehicle_parameters(problem))
+    interface = interface_of(problem.name)
+    general = (*_NODE, *_PLANNING, *_terminal_time_parameters(problem))
+    defaults: dict[str, Value] = {
+        "cost_tolerance": max(_COST_TOLERANCE, problem.cost_tolerance),
+        "defect_tolerance": problem.defect_tolerance,
+        **interface.defaults,
+    }
+    return tuple(
+        replace(parameter, default=defaults.get(parameter.name, parameter.default))
+        for parameter in (*interface.parameters, *general, *_vehicle_parameters(problem))
+    )
 
 
 def node_settings(
@@ -176,6 +108,7 @@ def node_settings(
         InvalidInputError: A solver is unknown, or a vehicle number is refused by the problem.
     """
     _check_solver(values["solver"])
+    interface = interface_of(problem.name)
     vehicle = _vehicle_values(problem, values)
     problem.pack(vehicle)
     return NodeSettings(
@@ -194,36 +127,15 @@ def node_settings(
                 solver=values["solver"],
             ),
         ),
-        inputs=InputSettings(
-            frame=values["landing_frame"],
-            state_max_age_s=values["state_max_age_s"],
-            mass_max_age_s=values["mass_max_age_s"],
-            future_tolerance_s=values["future_tolerance_s"],
-            mass_fallback_kg=values["mass_fallback_kg"],
-            limits=InputLimits(
-                position_max_m=values["position_max_m"],
-                speed_max_m_s=values["speed_max_m_s"],
-                ground_tolerance_m=values["ground_tolerance_m"],
-            ),
-        ),
+        inputs=interface.inputs(values),
         deadline_s=values["deadline_s"],
         state_reliability=values["state_reliability"],
-        markers=MarkerStyle(
-            thrust_arrow_m=values["thrust_arrow_m"],
-            glideslope_angle_rad=values.get(VEHICLE_PREFIX + "glideslope_angle_max"),
-            apex_m=tuple(values.get(VEHICLE_PREFIX + "final_position", (0.0, 0.0, 0.0))),
-        ),
+        markers=interface.drawing(values),
         log_period_s=values["log_period_s"],
     )
 
 
 _NODE = (
-    NodeParameter(
-        "landing_frame",
-        LANDING_FRAME,
-        "Frame of states and plans: z up, origin at the ground point that targets refer to.",
-        read_only=True,
-    ),
     NodeParameter(
         "state_reliability",
         RELIABLE,
@@ -244,55 +156,12 @@ _NODE = (
         "state_max_age_s", _INPUTS.state_max_age_s, "Largest age of a state.", "s", 0.0, 1e9
     ),
     NodeParameter(
-        "mass_max_age_s",
-        _INPUTS.mass_max_age_s,
-        "Largest age of a mass message, at its arrival and against the state that it completes.",
-        "s",
-        0.0,
-        1e9,
-    ),
-    NodeParameter(
         "future_tolerance_s",
         _INPUTS.future_tolerance_s,
         "How far a stamp may be ahead of the clock.",
         "s",
         0.0,
         1e9,
-    ),
-    NodeParameter(
-        "mass_fallback_kg",
-        _INPUTS.mass_fallback_kg,
-        "Mass for states without a fresh mass message; 0 to refuse such states.",
-        "kg",
-        0.0,
-        1e7,
-    ),
-    NodeParameter(
-        "position_max_m",
-        _LIMITS.position_max_m,
-        "Distance from the landing site beyond which a state is refused.",
-        "m",
-        1.0,
-        1e9,
-    ),
-    NodeParameter(
-        "speed_max_m_s",
-        _LIMITS.speed_max_m_s,
-        "Speed beyond which a state is refused.",
-        "m/s",
-        1.0,
-        1e6,
-    ),
-    NodeParameter(
-        "ground_tolerance_m",
-        _LIMITS.ground_tolerance_m,
-        "How far below the landing site a state may be, for sensor noise.",
-        "m",
-        0.0,
-        1e4,
-    ),
-    NodeParameter(
-        "thrust_arrow_m", 500.0, "Marker length of a plan's largest thrust.", "m", 0.0, 1e5
     ),
     NodeParameter(
         "log_period_s", 2.0, "Least time between two log lines of the same cause.", "s", 0.0, 3600.0
@@ -306,13 +175,6 @@ _PLANNING = (
         f"Cone solver, or several to try in order, separated by commas: {', '.join(SOLVER_NAMES)}.",
     ),
     NodeParameter("intervals", 50, "Number of intervals of a plan.", "", 5, 1000),
-    NodeParameter(
-        "terminal_time_source",
-        TerminalTime.FREE.value,
-        "free: optimised with every plan. fixed: parameters.terminal_time after the first state, "
-        "then what is left of it.",
-        choices=(TerminalTime.FREE.value, TerminalTime.FIXED.value),
-    ),
     NodeParameter("max_iterations", _OPTIONS.max_iterations, "Iteration limit.", "", 1, 1000),
     NodeParameter(
         "cost_tolerance",
@@ -324,7 +186,7 @@ _PLANNING = (
     ),
     NodeParameter(
         "defect_tolerance",
-        _OPTIONS.defect_tolerance,
+        OptimalControlProblem.defect_tolerance,
         "Converged when the dynamics are violated by less, relative to the states' scales.",
         "1",
         1e-15,
@@ -348,6 +210,36 @@ _PLANNING = (
 )
 
 
+def _terminal_time_parameters(problem: OptimalControlProblem) -> list[NodeParameter]:
+    """Where the terminal time comes from; networks exist for some problems only."""
+    free_or_fixed = (TerminalTime.FREE.value, TerminalTime.FIXED.value)
+    source = NodeParameter(
+        "terminal_time_source",
+        TerminalTime.FREE.value,
+        "free: optimised with every plan. fixed: parameters.terminal_time after the first state, "
+        "then what is left of it.",
+        choices=free_or_fixed,
+    )
+    if problem.name not in SHIPPED_NETWORKS:
+        return [source]
+    return [
+        replace(
+            source,
+            default=TerminalTime.PREDICTED.value,
+            description=source.description
+            + " predicted: by a network, and free where that is not valid.",
+            choices=(TerminalTime.PREDICTED.value, *free_or_fixed),
+        ),
+        NodeParameter(
+            NETWORK,
+            "",
+            "Network for terminal_time_source predicted: a file, relative to the parameter file "
+            "that names it; empty for the one that DSCP ships.",
+            may_be_empty=True,
+        ),
+    ]
+
+
 def _vehicle_parameters(problem: OptimalControlProblem) -> list[NodeParameter]:
     """The problem's own parameters, but for those that every state sets."""
     layout = problem_layout(problem)
@@ -359,7 +251,8 @@ def _vehicle_parameters(problem: OptimalControlProblem) -> list[NodeParameter]:
         if isinstance(declared.default, tuple):
             default = parameter_to_message_axes(layout, declared.default)
             description = declared.description.replace(", x up", "")
-            description += " Axes and order as in messages."
+            if follows_message_axes(layout, declared.default):
+                description += " Axes and order as in messages."
         else:
             default, description = float(declared.default), declared.description
         table.append(

@@ -5,9 +5,36 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from dscp_core.plan import Plan, PlanOutcome, PlanStatus
-from dscp_core.planner import Planner, PlannerSettings
+from dscp_core.planner import Planner, PlannerSettings, TerminalTimePredictor
 from msg_adapters.stamps import seconds_from_nanoseconds
 from msg_adapters.state import StampedState
+
+
+@dataclass(frozen=True)
+class PlannerSetup:
+    """What a planner is made of.
+
+    Attributes:
+        settings: What to plan and how.
+        predictor: For a predicted terminal time.
+        parameter_set: Names the parameter sets that all this comes from, for reports.
+    """
+
+    settings: PlannerSettings
+    predictor: TerminalTimePredictor | None
+    parameter_set: str
+
+    def planner(self) -> Planner:
+        """Compile the problem.
+
+        Raises:
+            InvalidInputError: A setting is refused.
+        """
+        return Planner(self.settings, self.predictor)
+
+    def plans_like(self, other: PlannerSetup) -> bool:
+        """Whether another one makes the same plans."""
+        return (self.settings, self.predictor) == (other.settings, other.predictor)
 
 
 @dataclass(frozen=True)
@@ -21,14 +48,20 @@ class _Certified:
 class PlanningSession:
     """Plans from stamped states. For one thread at a time."""
 
-    def __init__(self, settings: PlannerSettings) -> None:
+    def __init__(self, setup: PlannerSetup) -> None:
         """Compile the problem.
 
         Raises:
             InvalidInputError: A setting is refused.
         """
-        self._planner = Planner(settings)
+        self._planner = setup.planner()
+        self._setup = setup
         self._last: _Certified | None = None
+
+    @property
+    def parameter_set(self) -> str:
+        """Names the parameter sets that plans are made with."""
+        return self._setup.parameter_set
 
     def plan(self, state: StampedState, deadline_s: float) -> PlanOutcome:
         """Plan from a state, warm if an earlier plan covers it."""
@@ -50,11 +83,21 @@ class PlanningSession:
         """Forget the warm start."""
         self._last = None
 
-    def rebuild(self, settings: PlannerSettings) -> None:
-        """Replace the planner by one with other settings and forget the warm start.
+    def install(self, setup: PlannerSetup, planner: Planner) -> None:
+        """Plan with another planner, made of this setup, from now on; forget the warm start."""
+        self._planner, self._setup, self._last = planner, setup, None
+
+    def change(self, setup: PlannerSetup) -> bool:
+        """Plan with another setup from now on.
+
+        Returns:
+            Whether that took another planner: then the warm start is forgotten.
 
         Raises:
-            InvalidInputError: A setting is refused; the planner stays as it was.
+            InvalidInputError: A setting is refused; everything stays as it was.
         """
-        self._planner = Planner(settings)
-        self._last = None
+        if setup.plans_like(self._setup):
+            self._setup = setup
+            return False
+        self.install(setup, setup.planner())
+        return True

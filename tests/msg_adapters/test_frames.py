@@ -99,5 +99,5 @@ def test_layout_refuses_other_states():
 
 
 def test_other_problems_keep_their_names():
-    layout = state_layout("entry", ("r", "longitude"))
+    layout = state_layout("orbit", ("r", "longitude"))
     assert layout.to_message_order(np.array([[1.0, 2.0]])).tolist() == [[1.0, 2.0]]

@@ -21,6 +21,6 @@ def test_vectors_follow_axes_or_state(core, message):
 
 
 def test_vectors_of_other_problems_stay_as_they_are():
-    layout = state_layout("entry", ("r", "longitude", "latitude", "speed"))
+    layout = state_layout("orbit", ("r", "longitude", "latitude", "speed"))
     assert parameter_to_message_axes(layout, [1.0, 2.0, 3.0]) == [1.0, 2.0, 3.0]
     assert parameter_to_core_axes(layout, [1.0, 2.0, 3.0, 4.0]) == [1.0, 2.0, 3.0, 4.0]

@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rclpy.serialization import deserialize_message, serialize_message
 
-from dscp_core.plan import PlanOutcome, PlanStatus
+from dscp_core.plan import PlanOutcome, PlanStatus, TerminalTime
 from dscp_core.verification import Check, ControlHold, PlanCertificate
 from msg_adapters.diagnostics import Health, health_from_message, message_from_health
 from msg_adapters.errors import InputCode, RejectedInputError
@@ -40,6 +40,8 @@ attempts = st.builds(
     iterations=COUNTS,
     warm_started=st.booleans(),
     solver=st.none() | TEXT,
+    terminal_time_source=st.none() | TEXT,
+    terminal_time_reason=st.none() | TEXT,
     **dict.fromkeys(
         (
             "solve_time_ms",
@@ -86,6 +88,7 @@ reports = st.builds(
     input_stamp_ns=st.none() | STAMPS,
     latency_ms=NUMBERS,
     mass_source=st.none() | TEXT,
+    parameter_set=st.none() | TEXT,
     state=st.dictionaries(TEXT, st.floats(allow_nan=False, allow_infinity=False), max_size=8),
     attempt=st.none() | attempts,
     certificate=st.none() | certificates,
@@ -120,6 +123,8 @@ def outcome(**changes) -> PlanOutcome:
         "cost": -31760.0,
         "terminal_time_predicted_s": None,
         "terminal_time_used_s": 32.81,
+        "terminal_time_source": TerminalTime.FREE,
+        "terminal_time_reason": "",
         "warm_started": True,
         "solver": "qoco",
     }
@@ -136,6 +141,17 @@ def test_outcome_becomes_figures_in_milliseconds():
     assert attempt.terminal_time_predicted_s is None
     assert attempt.warm_started is True
     assert attempt.solver == "qoco"
+    assert attempt.terminal_time_source == "free"
+    assert attempt.terminal_time_reason is None
+
+
+def test_the_source_of_the_terminal_time_comes_with_its_reason():
+    reason = "mass: got 37000.0, expected 38000 kg"
+    attempt = attempt_from_outcome(outcome(terminal_time_reason=reason), None)
+    report = PlanReport(0, "state", 0, "CERTIFIED", "", "powered_descent", attempt=attempt)
+    pairs = {pair.key: pair.value for pair in encode(report).status[0].values}
+    assert pairs["terminal_time_source"] == "free"
+    assert pairs["terminal_time_reason"] == reason
 
 
 def test_numbers_that_do_not_exist_are_left_out_of_the_message():

@@ -11,11 +11,11 @@ from rclpy.serialization import deserialize_message, serialize_message
 from visualization_msgs.msg import Marker, MarkerArray
 
 from dscp_core.errors import InvalidInputError
+from msg_adapters.drawing import no_markers
 from msg_adapters.errors import InputCode, RejectedInputError
 from msg_adapters.visualisation import (
     MarkerStyle,
     markers_from_plan,
-    no_markers,
     path_from_plan,
     points_from_path,
 )
@@ -126,7 +126,7 @@ def test_zero_thrust_gives_finite_arrows():
 
 
 def test_nothing_to_show_deletes_everything():
-    markers = no_markers(STAMP_NS).markers
+    markers = no_markers(STAMP_NS, frame="landing_site").markers
     assert [marker.action for marker in markers] == [Marker.DELETEALL]
 
 

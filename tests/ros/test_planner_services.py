@@ -92,6 +92,22 @@ def test_reload_takes_the_file_over_as_a_whole(ros, tmp_path):
         assert len(client.trajectories[-1].points) == 61
 
 
+def test_reload_takes_back_what_the_file_no_longer_says_and_nothing_else(ros, tmp_path):
+    path = tmp_path / "vehicle.yaml"
+    arguments = parameter_file(path, intervals="60", max_iterations="30")
+    with local_planner(ros, arguments, intervals=60, max_iterations=30) as (client, planner):
+        node = planner._node
+        node.set_parameters([Parameter("max_iterations", value=40)])
+        parameter_file(path, cost_tolerance="1.0e-5")
+        answer = client.call("reload")
+        assert answer.success, answer.message
+        assert node.get_parameter("intervals").value == 50
+        assert node.get_parameter("max_iterations").value == 40
+        assert client.send_and_report().published
+        client.wait_for(lambda: client.trajectories)
+        assert len(client.trajectories[-1].points) == 51
+
+
 @pytest.mark.parametrize(
     ("values", "words"),
     [

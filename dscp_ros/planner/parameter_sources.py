@@ -1,0 +1,99 @@
+"""Parameter files and sets as they were at one moment, and who they say made a plan."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from dscp_core.terminal_time import vehicle_of
+from dscp_ros.parameter_set import ParameterSet, directory_of, load
+from dscp_ros.planner.interfaces import VEHICLE_PREFIX
+from dscp_ros.planner.parameter_files import ParameterArguments, read_file
+from dscp_ros.planner.parameters import NETWORK
+from dscp_ros.planner.predictors import NamedNetwork
+
+NO_SET = "none"
+"""Stands in reports for the label of a parameter set."""
+
+
+@dataclass(frozen=True)
+class ParameterSources:
+    """What the parameter files of the command line hold.
+
+    Attributes:
+        values: Node parameters by flat name, but for those that the command line sets itself.
+        sets: Those of the files that belong to parameter sets, in order.
+        network: What they say of the network, or None.
+    """
+
+    values: Mapping[str, Any]
+    sets: tuple[ParameterSet, ...]
+    network: NamedNetwork | None
+
+    def check_vehicle(self, parameters: Mapping[str, Any]) -> None:
+        """Refuse a vehicle that a set was not made for.
+
+        Args:
+            parameters: All parameters of the problem by name, SI, in the core's axes.
+
+        Raises:
+            ParameterSetError: A set is of another vehicle.
+        """
+        for parameter_set in self.sets:
+            parameter_set.check_vehicle(parameters)
+
+    def label(self, values: Mapping[str, Any], parameters: Mapping[str, Any]) -> str:
+        """Names the sets for reports, with what of them does not count (any more).
+
+        Args:
+            values: Node parameters in use.
+            parameters: All parameters of the problem by name, SI, in the core's axes.
+        """
+        labels = []
+        for one in self.sets:
+            changed = _differing(one.values, values)
+            vehicle = (
+                VEHICLE_PREFIX + name for name in _differing(one.vehicle, vehicle_of(parameters))
+            )
+            changed += [name for name in vehicle if name not in changed]
+            labels.append(f"{one.label} (changed: {', '.join(changed)})" if changed else one.label)
+        return " + ".join(labels) or NO_SET
+
+
+def read_sources(arguments: ParameterArguments, node_name: str) -> ParameterSources:
+    """Read the parameter files, later ones winning.
+
+    Args:
+        arguments: Parameter sources of the command line.
+        node_name: Fully qualified name of the node.
+
+    Raises:
+        InvalidInputError: A file is missing, no YAML, or no parameter file.
+        ParameterSetError: A file belongs to a set that is not what its provenance says.
+    """
+    values: dict[str, Any] = {}
+    sets: list[ParameterSet] = []
+    network = None
+    for path in arguments.files:
+        folder = directory_of(path)
+        if folder is None:
+            found: Mapping[str, Any] = read_file(path, node_name)
+            own = None
+        else:
+            sets.append(load(folder))
+            found, own = sets[-1].values, sets[-1].terminal_time_network
+        values.update(found)
+        if NETWORK in found:
+            network = NamedNetwork(str(found[NETWORK]), Path(path).parent, own)
+    kept = {name: value for name, value in values.items() if name not in arguments.names}
+    return ParameterSources(kept, tuple(sets), network if NETWORK in kept else None)
+
+
+def _differing(expected: Mapping[str, Any], given: Mapping[str, Any]) -> list[str]:
+    return [name for name, value in expected.items() if _plain(given.get(name)) != _plain(value)]
+
+
+def _plain(value: Any) -> Any:
+    return list(value) if isinstance(value, Sequence) and not isinstance(value, str) else value
