@@ -15,8 +15,13 @@ BENCHMARKS = {
     "sweep": "gradients against central differences, iterations and optimum of the paper's case",
     "random_states": "how many random states of the paper's box get a certified plan, and how fast",
     "phases": "where the time of a forward run goes, and what a backward run costs beside it",
+    "entry": "entry: overhead, backward against forward, growth with the number of intervals",
     "latency": "state in to trajectory out: planner, and node over ROS topics with its memory",
+    "training": "terminal-time network: error against wall time, the paper's recipe and ours",
+    "prediction": "terminal-time network: time of one prediction, difference to PyTorch",
+    "terminal_time_source": "free against predicted terminal times, by iteration limit",
     "sensitivity": "derivatives of one cone program against its solve, and against diffcp",
+    "tuning": "how a tuning's gradients scale with the number of states and with the workers",
 }
 
 
@@ -28,16 +33,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("names", nargs="*", metavar="NAME", help="benchmarks to run (default: all)")
     parser.add_argument("--list", action="store_true", help="list the benchmarks and stop")
-    parser.add_argument(
-        "--quick", action="store_true", help="fewer samples: under two minutes in all"
-    )
+    parser.add_argument("--quick", action="store_true", help="fewer samples: some minutes in all")
     parser.add_argument(
         "--output", type=Path, metavar="DIR", help="also write each report to DIR/NAME.json"
     )
     args = parser.parse_args(argv)
     if args.list:
         for name, summary in BENCHMARKS.items():
-            print(f"{name:14s} {summary}")
+            print(f"{name:20s} {summary}")
         return 0
     unknown = [name for name in args.names if name not in BENCHMARKS]
     if unknown:

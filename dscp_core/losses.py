@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -123,3 +124,31 @@ class ConvergenceLoss:
                 gradient.decisions[k, :size] += weight * reference
                 gradient.parameters[:] += weight * parameters
         return gradient
+
+
+@dataclass(frozen=True)
+class LogConvergenceLoss:
+    """Logarithm of the convergence metric, ``log(L / scale + floor)``.
+
+    The metric spans decades; its logarithm is what a descent makes even progress on.
+
+    Attributes:
+        scale: Unit of the metric.
+        floor: What is no more than rounding or the tolerance of the stopping test.
+    """
+
+    scale: float
+    floor: float
+
+    def _argument(self, transcription: Transcription, trace: ScpResult) -> float:
+        return ConvergenceLoss().value(transcription, trace) / self.scale + self.floor
+
+    def value(self, transcription: Transcription, trace: ScpResult) -> float:
+        """See `Loss.value`."""
+        return math.log(self._argument(transcription, trace))
+
+    def gradient(self, transcription: Transcription, trace: ScpResult) -> LossGradient:
+        """See `Loss.gradient`."""
+        metric = ConvergenceLoss().gradient(transcription, trace)
+        factor = 1.0 / (self.scale * self._argument(transcription, trace))
+        return LossGradient(factor * metric.decisions, factor * metric.parameters)

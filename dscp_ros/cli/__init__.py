@@ -18,5 +18,6 @@ class ExitCode(IntEnum):
     OK = 0
     BAD_INPUT = 2
     NO_PLAN = 3
+    NOT_BETTER = 4
     INTERRUPTED = 130  # 128 + SIGINT, the shells' convention
     BROKEN_PIPE = 141  # 128 + SIGPIPE

@@ -28,6 +28,7 @@ COMMANDS: dict[str, Command] = {
     "gradient": Command("dscp_ros.cli.gradient_command", "differentiate a plan, without ROS"),
     "study": Command("dscp_ros.cli.study_commands", "reproduce a published result"),
     "train": Command("dscp_ros.cli.train_command", "train the terminal-time network"),
+    "tune": Command("dscp_ros.cli.tune_command", "tune parameters on logs"),
     "evaluate": Command("dscp_ros.cli.evaluate_command", "measure a network against brute force"),
     "planner": Command("dscp_ros.cli.planner_command", "run the planner as a ROS 2 node"),
     "replay": Command("dscp_ros.cli.replay_command", "publish a bag's messages on ROS 2 topics"),
@@ -44,12 +45,12 @@ examples:
 
 `dscp COMMAND --help` explains each command and its units (SI).
 
-exit codes: 0 good, 2 bad input, 3 no plan, 130 interrupted.
+exit codes: 0 good, 2 bad input, 3 no plan, 4 no better set, 130 interrupted.
 With --json, an error is also printed on stdout, as {"error": {"type": ..., "message": ...}}.
 """
 
 # The extra that brings a module which an installation may lack. Message packages: see extra_of.
-EXTRA_OF_MODULE = {"rclpy": "ros", "rosgraph_msgs": "ros", "torch": "learn", "safetensors": "learn"}
+EXTRA_OF_MODULE = {"rclpy": "ros", "rosgraph_msgs": "ros", "torch": "learn"}
 MESSAGE_PACKAGE_ENDINGS = ("_msgs", "_interfaces", "_srvs")
 
 

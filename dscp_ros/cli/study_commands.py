@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import argparse
 import math
-import os
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dscp_core.errors import InvalidInputError
-from dscp_ros.cli import ExitCode
+from dscp_ros.cli import ExitCode, entry_study_commands
 from dscp_ros.cli.arguments import print_json, print_table
 from dscp_ros.cli.output_files import complete_file, write_csv
 
@@ -23,6 +22,8 @@ EPILOG = """\
 examples:
   dscp study terminal-time --quick
   dscp study terminal-time --output out/study --jobs 4
+  dscp study trust-region --quick
+  dscp study surface-to-mass --quick
 
 `dscp study STUDY --help` explains each study.
 """
@@ -55,6 +56,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )
     studies = parser.add_subparsers(title="studies", metavar="STUDY", required=True)
     _add_terminal_time(studies)
+    entry_study_commands.add_parsers(studies)
 
 
 def _add_terminal_time(studies: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -80,7 +82,10 @@ def _add_terminal_time(studies: argparse._SubParsersAction[argparse.ArgumentPars
         "--quick", action="store_true", help=f"fewer points: a step of {QUICK_STEP_S:g} s"
     )
     parser.add_argument(
-        "--jobs", type=int, metavar="N", help="processes (default: one per processor)"
+        "--jobs", type=int, metavar="N", help="how many at once (default: one per processor)"
+    )
+    parser.add_argument(
+        "--ray", metavar="ADDRESS", help="compute on the Ray cluster with this head, HOST:PORT"
     )
     parser.add_argument(
         "--output",
@@ -113,11 +118,10 @@ def run_terminal_time(args: argparse.Namespace) -> int:
 
     step = args.step if args.step is not None else (QUICK_STEP_S if args.quick else FULL_STEP_S)
     sweep = Sweep(args.start, args.stop, step)
-    jobs = len(os.sched_getaffinity(0)) if args.jobs is None else args.jobs
     args.output.mkdir(parents=True, exist_ok=True)
     # disable=None: no bar where stderr is no terminal.
     with tqdm(total=len(sweep.times_s), unit="point", disable=None) as bar:
-        points = run_sweep(sweep, jobs=jobs, report=bar.update)
+        points = run_sweep(sweep, jobs=args.jobs, ray_address=args.ray, report=bar.update)
     summary = summarise(sweep, points)
     table, picture = args.output / "terminal_time.csv", args.output / "terminal_time.png"
     write_csv(table, _COLUMNS, map(_row, points))

@@ -8,13 +8,24 @@ from core.toy_problems import cart
 from numpy.typing import NDArray
 
 from dscp_core.errors import InvalidInputError
-from dscp_core.losses import ConvergenceLoss, CostLoss, FinalStateLoss, Loss
+from dscp_core.losses import (
+    ConvergenceLoss,
+    CostLoss,
+    FinalStateLoss,
+    LogConvergenceLoss,
+    Loss,
+)
 from dscp_core.scp import Scp, ScpOptions, ScpResult
 from dscp_core.transcription import Transcription
 
 Array = NDArray[np.float64]
 
-LOSSES: tuple[Loss, ...] = (FinalStateLoss("position", -2.0), CostLoss(), ConvergenceLoss())
+LOSSES: tuple[Loss, ...] = (
+    FinalStateLoss("position", -2.0),
+    CostLoss(),
+    ConvergenceLoss(),
+    LogConvergenceLoss(3.0, 1e-3),
+)
 
 
 @pytest.fixture(scope="module")
@@ -60,13 +71,13 @@ def test_gradient_matches_differences(scp: Scp, trace: ScpResult, loss: Loss) ->
     for _ in range(5):
         decisions = rng.standard_normal(gradient.decisions.shape)
         parameters = rng.standard_normal(gradient.parameters.shape)
-        step = 1e-4
+        step = 1e-5
         ahead, behind = (
             loss.value(transcription, moved(scp, trace, decisions, parameters, sign * step))
             for sign in (1.0, -1.0)
         )
         along = np.sum(gradient.decisions * decisions) + gradient.parameters @ parameters
-        # Costs are cubic in decisions and time: the remainder is 1e-8 times numbers up to 100.
+        # The remainder is 1e-10 times third derivatives, up to 1e4 for the logarithm.
         assert along == pytest.approx((ahead - behind) / (2 * step), rel=1e-6, abs=1e-6)
 
 
@@ -91,6 +102,14 @@ def test_convergence_counts_from_the_second_iterate(scp: Scp, trace: ScpResult) 
     assert expected > 1e-3
     gradient = ConvergenceLoss().gradient(scp.transcription, trace)
     assert not gradient.decisions[0].any()
+
+
+def test_logarithm_of_the_metric_has_a_floor(scp: Scp, trace: ScpResult) -> None:
+    metric = ConvergenceLoss().value(scp.transcription, trace)
+    loss = LogConvergenceLoss(2.0, 1e-3)
+    assert loss.value(scp.transcription, trace) == pytest.approx(np.log(metric / 2.0 + 1e-3))
+    short = replace(trace, iterations=trace.iterations[:1])
+    assert loss.value(scp.transcription, short) == pytest.approx(np.log(1e-3))
 
 
 def test_single_iteration_has_converged(scp: Scp, trace: ScpResult) -> None:

@@ -1,0 +1,1 @@
+"""Offline tuner: parameters and networks from logged states, by gradients through the SCP."""

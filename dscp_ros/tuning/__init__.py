@@ -1,0 +1,1 @@
+"""From logs to what is tuned on, and from a tuning to a parameter set."""
