@@ -5,7 +5,7 @@
 #   make test PYTEST_ARGS="-n auto"  any pytest arguments
 
 PYTHON ?= python3
-EXTRAS ?= ros,learn,dev
+EXTRAS ?= ros,learn,ray,dev
 PYTEST_ARGS ?=
 
 VENV := .venv
@@ -14,10 +14,10 @@ comma := ,
 READY := $(VENV)/.ready-$(subst $(comma),-,$(EXTRAS))
 
 .DEFAULT_GOAL := help
-.PHONY: help setup test lint format demo benchmark clean
+.PHONY: help setup test lint format demo demo-entry benchmark clean
 
 help: ## list the targets
-	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
 setup: $(READY) ## create .venv and install everything into it
 
@@ -43,8 +43,12 @@ format: $(READY) ## format the code, fix what can be fixed
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
 
-demo: $(READY) ## replay a recorded descent into the planner node; results in out/demo
+demo: $(READY) ## replay descents into the planner node, tune it on a log, reload; results in out/demo
 	$(BIN)/python -m dscp_ros.demo --output out/demo
+	$(BIN)/python -m dscp_ros.demo --loop --output out/demo/loop
+
+demo-entry: $(READY) ## the same with a recorded entry; results in out/demo-entry
+	$(BIN)/python -m dscp_ros.demo --problem entry --output out/demo-entry
 
 benchmark: $(READY) ## print the measured figures
 	$(BIN)/python -m benchmarks

@@ -12,12 +12,15 @@ from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
+from rclpy.task import Future
+from std_srvs.srv import Trigger
 
 from dscp_core.errors import DscpError
 from dscp_ros.bag import BagWriter
 from dscp_ros.record import Recorder
 
 _SPIN_S = 0.05
+_SERVICE_S = 10.0
 
 
 class DemoTimeoutError(DscpError):
@@ -27,7 +30,8 @@ class DemoTimeoutError(DscpError):
 class Listener:
     """Records until its block ends."""
 
-    def __init__(self, executor: SingleThreadedExecutor, recorder: Recorder) -> None:
+    def __init__(self, node: Node, executor: SingleThreadedExecutor, recorder: Recorder) -> None:
+        self._node = node
         self._executor = executor
         self._recorder = recorder
 
@@ -39,6 +43,13 @@ class Listener:
     def count(self, topic: str) -> int:
         """Messages recorded so far."""
         return self._recorder.counts[topic]
+
+    def call(self, service: str) -> Future:
+        """Asks a service; the answer comes while this listens."""
+        client = self._node.create_client(Trigger, service)
+        if not client.wait_for_service(_SERVICE_S):
+            raise DemoTimeoutError(f"there is no service {service}")
+        return client.call_async(Trigger.Request())
 
     def listen_until(
         self, condition: Callable[[], bool], deadline_s: float, waiting_for: Callable[[], str]
@@ -74,7 +85,7 @@ def listening(output: Path, topics: Sequence[str]) -> Iterator[Listener]:
             node = Node("dscp_demo", context=context)
             executor = SingleThreadedExecutor(context=context)
             executor.add_node(node)
-            yield Listener(executor, Recorder(node, writer, topics))
+            yield Listener(node, executor, Recorder(node, writer, topics))
             executor.shutdown()
             node.destroy_node()
         finally:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -78,6 +79,7 @@ def run_session(
     rate: float,
     timeout_s: float,
     say: Callable[[str], None],
+    node_arguments: Sequence[str] = (),
 ) -> Path:
     """Replays bags into a planner node and records what it publishes.
 
@@ -87,6 +89,7 @@ def run_session(
         rate: Recorded seconds per second.
         timeout_s: Longest time for everything.
         say: Is told what happens.
+        node_arguments: Of the node's command line.
 
     Returns:
         The recording.
@@ -96,29 +99,99 @@ def run_session(
         DemoTimeoutError: Time is up.
         BagError: The recording cannot be written.
     """
+    with live_planner(
+        folder, timeout_s=timeout_s, say=say, node_arguments=node_arguments
+    ) as planner:
+        for bag in bags:
+            planner.replay(bag, rate)
+    return planner.recording
+
+
+class LivePlanner:
+    """The planner node in a process of its own, and this process recording what it publishes.
+
+    Attributes:
+        recording: Bag that is whole when the block of `live_planner` has ended.
+        listener: Records into it.
+    """
+
+    def __init__(
+        self,
+        node: Child,
+        listener: Listener,
+        recording: Path,
+        deadline_s: float,
+        say: Callable[[str], None],
+    ) -> None:
+        self._node = node
+        self._deadline_s = deadline_s
+        self._say = say
+        self.listener = listener
+        self.recording = recording
+
+    def replay(self, bag: InputBag, rate: float) -> None:
+        """Replays a bag and waits until the node is done with it.
+
+        Raises:
+            ChildFailedError: A process died or did not end.
+            DemoTimeoutError: Time is up.
+        """
+        self._say(f"replaying {bag.name}: {bag.states} states in {bag.seconds / rate:.0f} s")
+        log = self.recording.parent / f"{bag.name}.log"
+        with child("the replay", _replay(bag, rate), log) as replay:
+            _follow(self._node, replay, self.listener, self._deadline_s, self._say)
+        _await_quiet(self._node, self.listener, self._deadline_s)
+
+    def listen_until(self, condition: Callable[[], bool], waiting_for: str) -> None:
+        """Records until a condition holds.
+
+        Raises:
+            ChildFailedError: The node has ended.
+            DemoTimeoutError: Time is up.
+        """
+
+        def holds() -> bool:
+            self._node.require_running()
+            return condition()
+
+        self.listener.listen_until(holds, self._deadline_s, lambda: waiting_for)
+
+
+@contextmanager
+def live_planner(
+    folder: Path, *, timeout_s: float, say: Callable[[str], None], node_arguments: Sequence[str]
+) -> Iterator[LivePlanner]:
+    """Runs a planner node for the length of the block, and records what it publishes.
+
+    Args:
+        folder: Gets the recording and the processes' logs.
+        timeout_s: Longest time for everything.
+        say: Is told what happens.
+        node_arguments: Of the node's command line.
+
+    Raises:
+        ChildFailedError: The node died or did not end.
+        DemoTimeoutError: Time is up.
+        BagError: The recording cannot be written.
+    """
     deadline_s = time.monotonic() + timeout_s
     output = folder / "planner_output"
+    separator = () if "--ros-args" in node_arguments else ("--ros-args",)
     # The bags' clock is the node's: stamps keep their meaning, and so does the age of a stale one.
-    planner_command = [
-        *(sys.executable, "-m", "dscp_ros.planner.main"),
-        *("--ros-args", "-p", "use_sim_time:=true"),
+    command = [
+        *(sys.executable, "-m", "dscp_ros.planner.main", *node_arguments, *separator),
+        *("-p", "use_sim_time:=true"),
     ]
     say("starting the planner node")
     with (
-        child("the planner node", planner_command, folder / "planner.log") as planner,
+        child("the planner node", command, folder / "planner.log") as node,
         listening(output, OUTPUTS) as listener,
     ):
-        _await_node(planner, listener, min(deadline_s, time.monotonic() + _START_S))
+        _await_node(node, listener, min(deadline_s, time.monotonic() + _START_S))
         say(f"the node is up; recording to {output}")
-        for bag in bags:
-            seconds = bag.seconds / rate
-            say(f"replaying {bag.name}: {bag.states} states in {seconds:.0f} s")
-            with child("the replay", _replay(bag, rate), folder / f"{bag.name}.log") as replay:
-                _follow(planner, replay, listener, deadline_s, say)
-            _await_quiet(planner, listener, deadline_s)
+        yield LivePlanner(node, listener, output, deadline_s, say)
         say("stopping the planner node")
-        planner.stop()
-    return output
+        node.stop()
 
 
 def _replay(bag: InputBag, rate: float) -> list[str]:

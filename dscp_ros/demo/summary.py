@@ -18,7 +18,10 @@ from msg_adapters.report_message import report_from_message
 _STAMP_MARGIN_NS = 60 * 10**9
 """How far a stamp may be outside of its bag: stale and future ones are."""
 _MASS_SOURCE = "mass"
-_NAME_WIDTH, _WIDTH = 30, 13
+_NAME_WIDTH, _WIDTH = 32, 13
+
+Row = tuple[str, list[str]]
+"""Name, and a cell per column."""
 
 
 @dataclass(frozen=True)
@@ -85,32 +88,52 @@ def table(parts: Sequence[Figures]) -> str:
         tuple(report for part in parts for report in part.refusals),
     )
     columns = [*parts, everything] if len(parts) > 1 else list(parts)
-    failures = sorted(
-        {(r.code, r.code_name) for r in everything.attempts if r.code != PlanStatus.CERTIFIED}
-    )
-    rows: list[tuple[str, list[str]]] = [
+    rows = [
         ("", [_short(c.name) for c in columns]),
         ("states replayed", [str(c.states) for c in columns]),
         ("inputs refused", [str(len(c.refusals)) for c in columns]),
         ("superseded by a newer state", [str(c.superseded) for c in columns]),
+        *attempt_rows(columns),
+    ]
+    sets = parameter_set_lines(everything.attempts)
+    return "\n".join([*lines_of(rows), "", *sets, "", *_refusal_lines(everything.refusals)])
+
+
+def attempt_rows(columns: Sequence[Figures]) -> list[Row]:
+    """What became of the attempts, and what they took: a cell per column."""
+    failures = sorted(
+        {(r.code, r.code_name) for c in columns for r in c.attempts}
+        - {(int(PlanStatus.CERTIFIED), PlanStatus.CERTIFIED.name)}
+    )
+    rows = [
         ("planning attempts", [str(len(c.attempts)) for c in columns]),
         ("  certified", [str(c.certified) for c in columns]),
     ]
     for code, name in failures:
         counts = [sum(r.code == code for r in c.attempts) for c in columns]
         rows.append((f"  {name} ({code})", [str(count) for count in counts]))
-    rows += [
+    return [
+        *rows,
         ("iterations, mean / max", [_iterations(c) for c in columns]),
         ("planning, median / p99 [ms]", [_median_p99(_solve_times(c)) for c in columns]),
         ("latency, median / p99 [ms]", [_median_p99(_latencies(c)) for c in columns]),
         ("largest miss [m]", [_largest(c, "miss_position_m") for c in columns]),
         ("largest speed error [m/s]", [_largest(c, "miss_speed_m_s") for c in columns]),
     ]
-    lines = [
+
+
+def lines_of(rows: Sequence[Row]) -> list[str]:
+    """Rows as lines of a table."""
+    return [
         f"{name:<{_NAME_WIDTH}}" + "".join(f"{cell:>{_WIDTH}}" for cell in cells)
         for name, cells in rows
     ]
-    return "\n".join([*lines, "", *_refusal_lines(everything.refusals)])
+
+
+def parameter_set_lines(attempts: Sequence[PlanReport]) -> list[str]:
+    """With which parameter sets the attempts were made."""
+    counts = Counter(report.parameter_set or "not reported" for report in attempts)
+    return [f"parameter set {name}: {count} attempts" for name, count in counts.items()]
 
 
 def _refusal_lines(refusals: Sequence[PlanReport]) -> list[str]:

@@ -23,14 +23,15 @@ from mcap_ros2.decoder import DecoderFactory
 
 from dscp_ros.bag import BagReader, BagWriter, Qos
 from dscp_ros.cli import ExitCode
+from dscp_ros.parameter_set import load
 
 ROOT = Path(__file__).resolve().parents[2]
 DISPERSED = ROOT / "bags" / "powered_descent_dispersed"
 NOMINAL = ROOT / "bags" / "powered_descent_nominal"
 REPORT, TRAJECTORY = "/planner/report", "/planner/trajectory"
 MARK = "DSCP_DEMO_TEST"
-# Start of two interpreters and a few plans, on a machine that also does other things.
-PATIENCE_S = 90.0
+# Start of a few interpreters and some plans, on a machine that also does other things.
+PATIENCE_S = 240.0
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 
 
@@ -133,7 +134,7 @@ def table_of(lines: list[str]) -> dict[str, str]:
     for line in lines[start:]:
         if not line.strip():
             break
-        name, cells = line[:30].strip(), re.split(r"\s{2,}", line[30:].strip())
+        name, cells = line[:32].strip(), re.split(r"\s{2,}", line[32:].strip())
         rows[name] = cells[-1]
     return rows
 
@@ -260,3 +261,44 @@ def test_a_bag_without_the_planners_topics_is_refused(tmp_path: Path) -> None:
     with running(tmp_path / "out", "--bag", bag) as demo:
         assert demo.finish() == ExitCode.BAD_INPUT
     assert "/planner/vehicle_state" in demo.text
+
+
+@pytest.mark.timeout(PATIENCE_S)
+def test_the_loop_tunes_on_the_log_and_reloads_what_it_found(tmp_path: Path) -> None:
+    # One second of story, then sixteen states to tune on, and five that the tuning does not see.
+    log = excerpt(ROOT / "bags" / "ignitions_log", tmp_path / "log", 1.0 + 16 * 0.2)
+    unseen = excerpt(ROOT / "bags" / "ignitions_unseen", tmp_path / "unseen", 1.0 + 5 * 0.2)
+    out = tmp_path / "out"
+    with running(out, "--loop", "--bag", log, "--bag", unseen, "--epochs", "4") as demo:
+        code = demo.finish()
+        assert code == ExitCode.OK, demo.text
+        assert demo.processes() == []
+
+    tuned = load(out / "parameter_set")
+    assert tuned.terminal_time_network is not None
+    assert tuned.terminal_time_network.data.vehicle["thrust_max"] == 824000.0
+    assert tuned.provenance["logs"]
+    (first,) = re.findall(r"plans with parameter set (\S+),", demo.text)
+    assert first != tuned.label
+
+    reports = [values_of(report) for report in recorded(out)[REPORT]]
+    attempts = [report for report in reports if "iterations" in report]
+    sets = [report["parameter_set"].split(" ")[0] for report in attempts]
+    # First all of the log and the unseen with the one set, then the unseen with the other.
+    assert list(dict.fromkeys(sets)) == [first, tuned.label]
+    assert sets == sorted(sets, key=[first, tuned.label].index)
+    after = [report for report, name in zip(attempts, sets, strict=True) if name == tuned.label]
+    stamps = {report["input_stamp"] for report in after}
+    before = [
+        report
+        for report, name in zip(attempts, sets, strict=True)
+        if name == first and report["input_stamp"] in stamps
+    ]
+    assert {report["terminal_time_source"] for report in before} == {"free"}
+    assert "specific_impulse: got 279.2" in before[0]["terminal_time_reason"]
+    rows = {line[:32].strip(): line[32:].split() for line in demo.lines if line[:32].strip()}
+    predicted = sum(report["terminal_time_source"] == "predicted" for report in after)
+    assert rows["terminal time predicted"] == ["0", str(predicted)]
+    certified = sum(report["code"] == "0" for report in after)
+    assert rows["certified"][1] == str(certified)
+    assert rows["planning attempts"][1] == str(len(after))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,14 +13,14 @@ from dscp_core.verification import PlanCertificate, PlanVerifier
 from dscp_ros.bag import BagReader
 from dscp_ros.demo.session import TRAJECTORY
 from dscp_ros.demo.summary import Figures
-from msg_adapters.frames import POWERED_DESCENT, state_layout
+from msg_adapters.frames import state_layout
 from msg_adapters.report import PlanReport
 from msg_adapters.stamps import nanoseconds_from_stamp
 from msg_adapters.trajectory import plan_from_trajectory
 
 
 @dataclass(frozen=True)
-class Landing:
+class RecordedPlan:
     """A published plan.
 
     Attributes:
@@ -36,18 +35,17 @@ class Landing:
     certificate: PlanCertificate
     parameters: Mapping[str, Any]
 
-    @property
-    def start_text(self) -> str:
-        """Where the plan starts, for people."""
-        state = self.report.state
-        return (
-            f"{state['z']:.0f} m up, {math.hypot(state['x'], state['y']):.0f} m aside, "
-            f"at {math.hypot(state['vx'], state['vy'], state['vz']):.0f} m/s"
-        )
 
-
-def recorded_landing(recording: Path, parts: Sequence[Figures]) -> Landing | None:
+def recorded_plan(
+    recording: Path, parts: Sequence[Figures], problem_name: str, frame: str
+) -> RecordedPlan | None:
     """The first plan that was published for the last bag with plans; None without any.
+
+    Args:
+        recording: What the node published.
+        parts: Figures of the replayed bags, in order.
+        problem_name: What was planned for, with its default vehicle.
+        frame: Frame of the trajectories.
 
     Raises:
         BagError: The recording cannot be read.
@@ -55,7 +53,7 @@ def recorded_landing(recording: Path, parts: Sequence[Figures]) -> Landing | Non
     """
     published = [[r for r in part.attempts if r.published] for part in parts]
     reports = {r.input_stamp_ns: r for r in next((p for p in reversed(published) if p), [])}
-    problem = problems.get(POWERED_DESCENT)
+    problem = problems.get(problem_name)
     layout = state_layout(problem.name, [state.name for state in problem.states])
     with BagReader(recording) as reader:
         for _, message in reader.decoded_messages([TRAJECTORY]):
@@ -67,9 +65,10 @@ def recorded_landing(recording: Path, parts: Sequence[Figures]) -> Landing | Non
                 layout,
                 control_names=[control.name for control in problem.controls],
                 control_states=problem.control_states,
+                frame=frame,
             )
             packed = problem.table.pack()
             verifier = PlanVerifier(problem, len(plan.times_s) - 1)
             certificate = verifier.certify(plan.times_s, plan.states, plan.controls, packed)
-            return Landing(plan, report, certificate, problem.table.unpack(packed))
+            return RecordedPlan(plan, report, certificate, problem.table.unpack(packed))
     return None
