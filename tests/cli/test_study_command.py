@@ -16,9 +16,16 @@ from dscp_core.errors import InvalidInputError
 from dscp_core.losses import FinalStateLoss
 from dscp_core.planner import Planner, PlannerSettings
 from dscp_core.scp import ScpOptions, ScpStatus
+from dscp_core.studies import (
+    surface_to_mass,
+    surface_to_mass_figures,
+    trust_region,
+    trust_region_cases,
+)
 from dscp_core.studies.differences import RunDifferences
 from dscp_core.studies.terminal_time import Sweep, SweepPoint, run_sweep, summarise
 from dscp_core.studies.terminal_time_figure import sweep_figure
+from dscp_core.studies.trust_region_cases import CASES
 from dscp_ros.cli import ExitCode
 from dscp_ros.cli.main import main
 
@@ -62,6 +69,76 @@ def test_sweep_prints_and_writes_what_it_found(
     }
 
 
+def test_trust_region_prints_and_writes(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(trust_region, "QUICK_POINTS", (2, 2))
+    monkeypatch.setattr(trust_region_cases, "PAPER_INTERVALS", 12)
+    arguments = ["study", "trust-region", "--quick", "--output", str(tmp_path / "new"), "--json"]
+    assert main(arguments) == ExitCode.OK
+    summary = json.loads(capsys.readouterr().out, parse_constant=refuse)
+    assert summary["points"] == 4
+    assert [case["case"] for case in summary["cases"]] == ["case1", "case2", "case3", "case4"]
+    assert summary["resumed"] == 0
+    assert len(summary["files"]) == 8
+    assert all(Path(file).stat().st_size > 0 for file in summary["files"])
+    with Path(summary["files"][0]).open(newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    corners = [("1.0", "-1.0"), ("1.0", "2.0"), ("2.0", "-1.0"), ("2.0", "2.0")]
+    assert [(row["log_gamma"], row["log_control"]) for row in rows] == corners
+
+    monkeypatch.setattr(trust_region_cases, "PAPER_INTERVALS", 13)
+    assert main(arguments) == ExitCode.BAD_INPUT
+    error = json.loads(capsys.readouterr().out)["error"]
+    assert "intervals differ" in error["message"]
+
+
+def test_surface_to_mass_prints_and_writes(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # One case and few intervals: the numbers mean nothing, and take a second.
+    paper = {("case4", 12): surface_to_mass.PAPER["case4", 100]}
+    for module in (surface_to_mass, surface_to_mass_figures):
+        monkeypatch.setattr(module, "PAPER", paper)
+        monkeypatch.setattr(module, "CASES", CASES[3:])
+    monkeypatch.setattr(surface_to_mass, "QUICK_POINTS", {12: 3})
+    arguments = ["study", "surface-to-mass", "--quick", "--output", str(tmp_path)]
+    assert main([*arguments, "--json"]) == ExitCode.OK
+    document = json.loads(capsys.readouterr().out, parse_constant=refuse)
+    (row,) = document["rows"]
+    assert (row["case"], row["intervals"]) == ("case4", 12)
+    assert set(row["gradient_correlation"]) == {"equal_k", "sweep", "sweep_all"}
+    assert {"optimal_ratio", "optimal_cost", "mean_iterations", "std_iterations"} <= set(row)
+    assert len(document["files"]) == 4
+    assert document["resumed"] == 0
+    assert main(arguments) == ExitCode.OK
+    captured = capsys.readouterr()
+    assert "4 results of an earlier run used" in captured.err
+    assert "case4" in captured.out
+
+
+@pytest.mark.parametrize("study", ["trust-region", "surface-to-mass"])
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--jobs", "0"], "--jobs"),
+        (["--output", __file__], "--output"),
+        (["--ray", "nowhere"], "HOST:PORT"),
+    ],
+)
+def test_bad_input_of_the_entry_studies(
+    study: str,
+    arguments: list[str],
+    words: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["study", study, *arguments]) == ExitCode.BAD_INPUT
+    assert words in capsys.readouterr().err
+
+
 def test_processes_agree_with_one_process() -> None:
     sweep = Sweep(32.5, 33.3, 0.2, settings=COARSE)
     done: list[int] = []
@@ -71,7 +148,7 @@ def test_processes_agree_with_one_process() -> None:
     assert [p.terminal_time_s for p in together] == list(sweep.times_s)
     for one, other in zip(together, alone, strict=True):
         assert one.iterations == other.iterations
-        # Threads of BLAS may sum in another order.
+        # A solver keeps some state from point to point, and the points are shared out.
         assert one.gradient_kg_s == pytest.approx(other.gradient_kg_s, rel=1e-7)
 
 
