@@ -6,7 +6,7 @@ import math
 import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Protocol
+from typing import Any, Protocol
 
 import casadi as ca
 import numpy as np
@@ -50,7 +50,7 @@ class TerminalTimePredictor(Protocol):
 
 @dataclass(frozen=True)
 class PlannerSettings:
-    """What to plan and how.
+    """What to plan and how; the defaults are those of powered descent, see `suited`.
 
     Attributes:
         problem: Name of the problem.
@@ -69,6 +69,27 @@ class PlannerSettings:
     terminal_time: TerminalTime = TerminalTime.FIXED
     hold: ControlHold = ControlHold.MEAN
     options: ScpOptions = field(default_factory=ScpOptions)
+
+    @staticmethod
+    def suited(problem: str, formulation: str | None = None, **changes: Any) -> PlannerSettings:
+        """Settings with the number of intervals and the terminal time that suit a problem.
+
+        Args:
+            problem: Name of the problem.
+            formulation: Its formulation, or None for the default.
+            **changes: Other attributes.
+
+        Raises:
+            InvalidInputError: Unknown problem or formulation.
+        """
+        declared = problems.get(problem, formulation)
+        own: dict[str, Any] = {
+            "intervals": declared.default_intervals,
+            "terminal_time": TerminalTime.FREE
+            if declared.free_terminal_time
+            else TerminalTime.FIXED,
+        }
+        return PlannerSettings(problem, formulation, **{**own, **changes})
 
 
 @dataclass(frozen=True)

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dscp_core.problems.entry.figure import entry_figure
 from dscp_core.errors import InvalidInputError
 from dscp_core.planner import Planner, PlannerSettings, TerminalTime
 from dscp_core.plotting import plan_figure
+from dscp_core.problems.entry.figure import entry_figure
 
 
 @pytest.fixture(scope="module")

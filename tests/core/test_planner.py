@@ -15,6 +15,7 @@ from dscp_core.planner import Planner, PlannerSettings, TerminalTime
 from dscp_core.scp import ScpOptions
 from dscp_core.solvers import SolverSettings
 from dscp_core.terminal_time import TerminalTimeNetwork
+from dscp_core.verification import ControlHold
 
 Array = NDArray[np.float64]
 
@@ -462,3 +463,11 @@ def test_status_numbers_are_stable() -> None:
         "SOLVER_FAILURE": 5,
         "INVALID_STATE": 6,
     }
+
+
+def test_settings_that_suit_a_problem_are_its_own() -> None:
+    entry = PlannerSettings.suited("entry", hold=ControlHold.LINEAR)
+    assert (entry.intervals, entry.terminal_time) == (100, TerminalTime.FREE)
+    assert entry.hold is ControlHold.LINEAR
+    assert PlannerSettings.suited("powered_descent") == PlannerSettings()
+    assert PlannerSettings.suited("entry", intervals=60).intervals == 60

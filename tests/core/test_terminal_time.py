@@ -116,7 +116,7 @@ def test_another_vehicle_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InvalidInputError, match=r"thrust_max: got 900000.0, expected 845200.0"):
         TerminalTimeNetwork.load(path, vehicle={**VEHICLE, "thrust_max": 900e3})
     other = {"thrust_max": 900e3, "final_position": [1.0, 0.0, 0.0]}
-    with pytest.raises(InvalidInputError, match="final_position: got .*; thrust_max differ too"):
+    with pytest.raises(InvalidInputError, match=r"final_position: got .*; thrust_max differ too"):
         TerminalTimeNetwork.load(path, vehicle=other)
     with pytest.raises(InvalidInputError, match="final_position"):
         TerminalTimeNetwork.load(path, vehicle={"thrust_max": 845.2e3})
