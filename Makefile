@@ -2,11 +2,11 @@
 #
 #   make setup PYTHON=python3.12     another Python, 3.11 or newer
 #   make setup EXTRAS=ros,dev        without torch; give the same EXTRAS to the other targets
-#   make test PYTEST_ARGS="-n auto"  any pytest arguments
+#   make test PYTEST_ARGS="-n 0 -x"  any pytest arguments (by default, all cores)
 
 PYTHON ?= python3
 EXTRAS ?= ros,learn,ray,dev
-PYTEST_ARGS ?=
+PYTEST_ARGS ?= -n auto
 
 VENV := .venv
 BIN := $(VENV)/bin

@@ -12,6 +12,7 @@ from dscp_core.studies.grid import Item, Row
 from dscp_core.studies.surface_to_mass import (
     PAPER,
     changes_count,
+    false_stop,
     regular_difference,
     rows_of,
     solved_points,
@@ -36,12 +37,16 @@ def sweep_figure(items: Sequence[Item], rows: Sequence[Row], intervals: int) -> 
         intervals: Which number of intervals.
     """
     from matplotlib.figure import Figure
+    from matplotlib.ticker import MaxNLocator
 
     figure = Figure(figsize=(9.0, 9.0), dpi=130, layout="constrained")
     cost, iterations = figure.subplots(2, 1, sharex=True, height_ratios=(1.4, 1.0))
+    all_costs: list[float] = []
     for case in CASES:
         points, descent = rows_of(items, rows, case.name, intervals)
-        points = solved_points(points)
+        solved = solved_points(points)
+        points = [row for row in solved if not false_stop(row)]
+        stops = [row for row in solved if false_stop(row)]
         ratios = np.array([row["ratio"] for row in points])
         costs = np.array([row["cost"] for row in points])
         colour = CASE_COLOURS[case.name]
@@ -68,14 +73,32 @@ def sweep_figure(items: Sequence[Item], rows: Sequence[Row], intervals: int) -> 
                 label="by gradient descent" if case is CASES[-1] else None,
             )
         cost.axvline(PAPER[case.name, intervals].ratio, color=colour, linestyle=":", linewidth=1.0)
-        iterations.step(
-            ratios, [row["iterations"] for row in points], where="mid", color=colour, linewidth=1.3
+        all_costs += costs.tolist()
+        cost.plot(
+            [row["ratio"] for row in stops],
+            [row["cost"] for row in stops],
+            "x",
+            color=colour,
+            markersize=6,
+            label="stopped far from the dynamics" if case is CASES[-1] else None,
         )
+        iterations.step(
+            [row["ratio"] for row in solved],
+            [row["iterations"] for row in solved],
+            where="mid",
+            color=colour,
+            linewidth=1.3,
+        )
+    if all_costs:
+        # What is far off only is a stop after two or three iterations.
+        margin = 0.1 * (max(all_costs) - min(all_costs))
+        cost.set_ylim(min(all_costs) - margin, max(all_costs) + 2.0 * margin)
     cost.set_title(
         f"performance index, N = {intervals} (dotted: the paper's optima)", loc="left", fontsize=11
     )
     cost.legend(fontsize=8, ncols=2)
     iterations.set_title("iterations", loc="left", fontsize=11)
+    iterations.yaxis.set_major_locator(MaxNLocator(integer=True))
     iterations.set_xlabel(r"$\omega_{S/m}$")
     for axes in (cost, iterations):
         draw_panel_style(axes)
@@ -84,6 +107,8 @@ def sweep_figure(items: Sequence[Item], rows: Sequence[Row], intervals: int) -> 
 
 def gradient_figure(items: Sequence[Item], rows: Sequence[Row], intervals: int) -> Figure:
     """Gradients through the iterations against differences: the sweep's, and at equal K.
+
+    The sweep is without its false stops.
 
     Args:
         items: Of the sweep.
@@ -95,7 +120,8 @@ def gradient_figure(items: Sequence[Item], rows: Sequence[Row], intervals: int) 
     figure = Figure(figsize=(12.0, 6.0), dpi=130, layout="constrained")
     swept, equal = figure.subplots(1, 2)
     for case in CASES:
-        points = solved_points(rows_of(items, rows, case.name, intervals)[0])
+        solved = solved_points(rows_of(items, rows, case.name, intervals)[0])
+        points = [row for row in solved if not false_stop(row)]
         gradients = np.array([row["gradient"] for row in points])
         slopes = np.array(sweep_slopes(points))
         changed = np.array(changes_count(points), dtype=bool)
@@ -108,7 +134,7 @@ def gradient_figure(items: Sequence[Item], rows: Sequence[Row], intervals: int) 
             label="number of iterations changes" if case is CASES[-1] else None,
             **style,
         )
-        regular = [row for row in points if regular_difference(row)]
+        regular = [row for row in solved if regular_difference(row)]
         equal.plot(
             [row["gradient"] for row in regular],
             [row["difference"] for row in regular],

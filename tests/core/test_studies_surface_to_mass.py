@@ -144,5 +144,5 @@ def test_figures(tmp_path: Path) -> None:
         (figures.sweep_figure(items, rows, 100), figures.gradient_figure(items, rows, 200))
     ):
         path = tmp_path / f"{number}.png"
-        figure.savefig(path)
-        assert path.stat().st_size > 10_000
+        figure.savefig(path, dpi=40)
+        assert path.stat().st_size > 2_000

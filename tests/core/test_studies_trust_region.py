@@ -180,5 +180,5 @@ def test_figures(cases: dict[str, Row], tmp_path: Path) -> None:
         )
     ):
         path = tmp_path / f"{number}.png"
-        figure.savefig(path)
-        assert path.stat().st_size > 10_000
+        figure.savefig(path, dpi=40)
+        assert path.stat().st_size > 2_000
