@@ -89,29 +89,27 @@ class RayEngine(Generic[Item, Result]):
     def map(self, items: Sequence[Item]) -> Iterator[Result]:
         """See `dscp_core.parallel.Engine.map`; only a few items are under way at any time."""
         waiting = iter(items)
+        # What is left here when nobody asks for more is finished and forgotten: `ray.cancel` would
+        # now and then end this process, by a failed check in Ray 2.60.
         under_way: deque[Any] = deque()
         number = 0
-        try:
-            while True:
-                for item in islice(waiting, self._most_under_way - len(under_way)):
-                    under_way.append(self._task.remote(self._key, [self._setup], item))
-                if not under_way:
-                    return
-                try:
-                    result = ray.get(under_way[0])
-                except exceptions.RayTaskError as error:
-                    raise _original(error) from error
-                except exceptions.RayError as error:
-                    raise WorkerLostError(
-                        f"a worker died at item {number} of {len(items)}, and at each of "
-                        f"{self._most_retries} retries: {type(error).__name__}"
-                    ) from error
-                under_way.popleft()
-                number += 1
-                yield result
-        finally:
-            for task in under_way:
-                ray.cancel(task)
+        while True:
+            for item in islice(waiting, self._most_under_way - len(under_way)):
+                under_way.append(self._task.remote(self._key, [self._setup], item))
+            if not under_way:
+                return
+            try:
+                result = ray.get(under_way[0])
+            except exceptions.RayTaskError as error:
+                raise _original(error) from error
+            except exceptions.RayError as error:
+                raise WorkerLostError(
+                    f"a worker died at item {number} of {len(items)}, and at each of "
+                    f"{self._most_retries} retries: {type(error).__name__}"
+                ) from error
+            under_way.popleft()
+            number += 1
+            yield result
 
     def close(self) -> None:
         """Disconnect, which ends the workers; a connection made by others is left alone."""
