@@ -39,7 +39,7 @@ def measure(*, quick: bool) -> Report:
     """Mean loss and gradient over many states, as in one epoch of a tuning."""
     report = Report("tuning")
     _measure_scaling(report, (50, 200) if quick else (100, 1000, 10000))
-    _measure_workers(report, 24 if quick else 128, 2 if quick else 5)
+    _measure_workers(report, 64 if quick else 128, 2 if quick else 5)
     report.notes += [
         f"an evaluation is the mean loss (fuel) and its gradient over all states, N = {INTERVALS}, "
         f"t_f = {TIME_S:g} s, tuned: {TUNED}",
