@@ -295,6 +295,14 @@ class OptimalControlProblem:
             values.update(found)
         return values
 
+    def initial_state_values(self, state: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
+        """Values, by name, of the parameters that hold an initial state (nx,), SI."""
+        values, start = {}, 0
+        for name in self.initial_state_parameters:
+            values[name] = state[start : start + self.table[name].size]
+            start += self.table[name].size
+        return values
+
     def _scp_parameters(self) -> Sequence[Parameter]:
         """Parameters of the algorithm (theta_SCP), appended to those of the problem."""
         nx, nu = len(self.states), len(self.controls)

@@ -197,13 +197,8 @@ class Planner:
         for name, value in zip(self.state_names, state, strict=True):
             if not math.isfinite(value):
                 raise InvalidInputError(name, float(value), "finite")
-        table, start = self.problem.table, 0
-        changed: dict[str, Value] = {}
-        for name in self.problem.initial_state_parameters:
-            part = state[start : start + table[name].size]
-            changed[name] = part
-            start += part.size
-        packed = table.pack(changed, base=self.parameters)
+        table = self.problem.table
+        packed = table.pack(self.problem.initial_state_values(state), base=self.parameters)
         if self.problem.check_state is not None:
             self.problem.check_state(state, table.unpack(packed))
         return packed

@@ -328,10 +328,7 @@ def with_initial_state(problem: OptimalControlProblem, packed: Array, state: Arr
         packed: (P,), SI.
         state: (nx,), SI.
     """
-    changed, start = packed.copy(), 0
-    for name in problem.initial_state_parameters:
-        where = problem.table.slice(name)
-        size = where.stop - where.start
-        changed[where] = state[start : start + size]
-        start += size
+    changed = packed.copy()
+    for name, value in problem.initial_state_values(state).items():
+        changed[problem.table.slice(name)] = value
     return changed

@@ -113,10 +113,7 @@ def _check(problem: OptimalControlProblem, base: Array, sample: Sample) -> None:
     state = np.asarray(sample.state, dtype=np.float64)
     if state.shape != (size,):
         raise InvalidInputError("state", f"shape {state.shape}", f"shape ({size},)")
-    changed, start = {}, 0
-    for name in problem.initial_state_parameters:
-        changed[name] = state[start : start + table[name].size]
-        start += table[name].size
+    changed = problem.initial_state_values(state)
     if sample.terminal_time_s is not None:
         changed[TERMINAL_TIME] = np.array([sample.terminal_time_s])
     packed = table.pack(changed, base=base)

@@ -1,4 +1,4 @@
-"""What `dscp plan` and `dscp gradient` share: options that describe a case, and strict JSON."""
+"""What commands share: options that describe a case or a study, and strict JSON."""
 
 from __future__ import annotations
 
@@ -71,6 +71,24 @@ def add_case_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="NAME[,NAME]",
         help="clarabel (default), qoco, ecos, or several to try in this order",
     )
+
+
+def add_study_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declares where a study computes, and where its results go."""
+    parser.add_argument(
+        "--jobs", type=int, metavar="N", help="how many at once (default: one per processor)"
+    )
+    parser.add_argument(
+        "--ray", metavar="ADDRESS", help="compute on the Ray cluster with this head, HOST:PORT"
+    )
+    parser.add_argument(
+        "--output",
+        type=Path,
+        default=Path("out/study"),
+        metavar="DIR",
+        help="where the files go (default %(default)s)",
+    )
+    parser.add_argument("--json", action="store_true", help="print the summary as JSON on stdout")
 
 
 def overrides(

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from dscp_core.errors import InvalidInputError
 from dscp_ros.cli import ExitCode
-from dscp_ros.cli.arguments import print_json, print_table
+from dscp_ros.cli.arguments import add_study_arguments, print_json, print_table
 from dscp_ros.cli.output_files import complete_file, write_csv
 
 if TYPE_CHECKING:
@@ -78,22 +78,9 @@ def add_parsers(studies: argparse._SubParsersAction[argparse.ArgumentParser]) ->
 def _add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--quick", action="store_true", help="a coarse grid")
     parser.add_argument(
-        "--jobs", type=int, metavar="N", help="how many at once (default: one per processor)"
-    )
-    parser.add_argument(
-        "--ray", metavar="ADDRESS", help="compute on the Ray cluster with this head, HOST:PORT"
-    )
-    parser.add_argument(
-        "--output",
-        type=Path,
-        default=Path("out/study"),
-        metavar="DIR",
-        help="where the files go (default %(default)s)",
-    )
-    parser.add_argument(
         "--restart", action="store_true", help="forget the results of an earlier run"
     )
-    parser.add_argument("--json", action="store_true", help="print the summary as JSON on stdout")
+    add_study_arguments(parser)
 
 
 def run_trust_region(args: argparse.Namespace) -> int:

@@ -5,12 +5,11 @@ from __future__ import annotations
 import argparse
 import math
 from dataclasses import asdict
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dscp_core.errors import InvalidInputError
 from dscp_ros.cli import ExitCode, entry_study_commands
-from dscp_ros.cli.arguments import print_json, print_table
+from dscp_ros.cli.arguments import add_study_arguments, print_json, print_table
 from dscp_ros.cli.output_files import complete_file, write_csv
 
 if TYPE_CHECKING:
@@ -81,20 +80,7 @@ def _add_terminal_time(studies: argparse._SubParsersAction[argparse.ArgumentPars
     parser.add_argument(
         "--quick", action="store_true", help=f"fewer points: a step of {QUICK_STEP_S:g} s"
     )
-    parser.add_argument(
-        "--jobs", type=int, metavar="N", help="how many at once (default: one per processor)"
-    )
-    parser.add_argument(
-        "--ray", metavar="ADDRESS", help="compute on the Ray cluster with this head, HOST:PORT"
-    )
-    parser.add_argument(
-        "--output",
-        type=Path,
-        default=Path("out/study"),
-        metavar="DIR",
-        help="where the files go (default %(default)s)",
-    )
-    parser.add_argument("--json", action="store_true", help="print the summary as JSON on stdout")
+    add_study_arguments(parser)
     parser.set_defaults(run=run_terminal_time)
 
 

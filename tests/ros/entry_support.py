@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import signal
 import subprocess
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -14,9 +13,9 @@ from rclpy.parameter import Parameter
 from ros.planner_support import (
     PATIENT,
     PLAN_TIMEOUT_S,
-    START_TIMEOUT_S,
     Harness,
     PlannerClient,
+    end,
     now_ns,
     start,
 )
@@ -78,14 +77,7 @@ def running_entry_planner(
         client.wait_until_connected(process)
         yield client, process
     finally:
-        if process.poll() is None:
-            process.send_signal(signal.SIGTERM)
-        try:
-            process.communicate(timeout=START_TIMEOUT_S)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.communicate()
-            raise
+        end(process)
 
 
 @contextmanager

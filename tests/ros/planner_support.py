@@ -171,6 +171,18 @@ def start(ros: Harness, arguments: Sequence[str] = ()) -> subprocess.Popen[str]:
     )
 
 
+def end(process: subprocess.Popen[str]) -> None:
+    """End a node's process by SIGTERM; one that does not end in time is killed and an error."""
+    if process.poll() is None:
+        process.send_signal(signal.SIGTERM)
+    try:
+        process.communicate(timeout=START_TIMEOUT_S)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.communicate()
+        raise
+
+
 @contextmanager
 def running_planner(
     ros: Harness, arguments: Sequence[str] = ()
@@ -184,14 +196,7 @@ def running_planner(
         client.wait_until_connected(process)
         yield client, process
     finally:
-        if process.poll() is None:
-            process.send_signal(signal.SIGTERM)
-        try:
-            process.communicate(timeout=START_TIMEOUT_S)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.communicate()
-            raise
+        end(process)
 
 
 @contextmanager
