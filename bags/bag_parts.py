@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from sensor_msgs.msg import JointState
 
-from dscp_core.plan import PlanStatus
+from dscp_core.planning.plan import PlanStatus
 from dscp_ros.bag import Qos
 from msg_adapters.errors import InputCode
 

@@ -12,11 +12,10 @@ import scipy.integrate
 from numpy.typing import NDArray
 
 from dscp_core import problems
-from dscp_core.compiled import CompiledFunction
-from dscp_core.ocp import OptimalControlProblem
-from dscp_core.plan import Plan, PlanOutcome, PlanStatus
-from dscp_core.planner import Planner
-from dscp_core.stages import named
+from dscp_core.planning.plan import Plan, PlanOutcome, PlanStatus
+from dscp_core.planning.planner import Planner
+from dscp_core.problem.declaration import OptimalControlProblem, named
+from dscp_core.transcription.compiled import CompiledFunction
 from dscp_ros.planner.interfaces import VEHICLE_PREFIX
 from dscp_ros.planner.parameters import node_settings, parameter_table
 

@@ -27,9 +27,9 @@ from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 
-from dscp_core.plan import PlanStatus
-from dscp_core.planner import Planner, PlannerSettings, TerminalTime
-from dscp_core.simulation import DescentRecord, Replan, simulate_descent
+from dscp_core.planning.plan import PlanStatus
+from dscp_core.planning.planner import Planner, PlannerSettings, TerminalTime
+from dscp_core.problems.powered_descent.simulation import DescentRecord, Replan, simulate_descent
 from dscp_ros.bag import BagWriter
 from msg_adapters.errors import InputCode
 from msg_adapters.frames import (

@@ -25,7 +25,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 
 from dscp_core import problems
-from dscp_core.plan import PlanOutcome
+from dscp_core.planning.plan import PlanOutcome
 from dscp_ros.bag import BagWriter
 from msg_adapters.errors import InputCode
 from msg_adapters.frames import PLANET_FRAME, StateLayout, state_layout

@@ -9,7 +9,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from benchmarks.timing import Array
-from dscp_core.cone_program import ConePattern, ConeValues
+from dscp_core.cone.program import ConePattern, ConeValues
 
 MODES = ("lsqr", "dense")
 

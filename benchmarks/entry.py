@@ -10,10 +10,11 @@ import numpy as np
 
 from benchmarks.report import Cell, Report, Table
 from benchmarks.timing import Array, alternated, clocked
-from dscp_core import dscp, problems
-from dscp_core.losses import CostLoss
-from dscp_core.scp import Scp, ScpOptions, ScpResult
-from dscp_core.transcription import Transcription
+from dscp_core import problems
+from dscp_core.gradients.losses import CostLoss
+from dscp_core.gradients.run import unrolled
+from dscp_core.scp.scp import Scp, ScpOptions, ScpResult
+from dscp_core.transcription.transcription import Transcription
 
 INTERVALS = (50, 100, 200, 500, 1000)
 ITERATIONS = 6
@@ -97,7 +98,7 @@ def _measured(intervals: int, rounds: int) -> _Size:
     plain = Scp(transcription, ScpOptions(fixed_iterations=ITERATIONS))
     polished = Scp(transcription, ScpOptions.for_gradients(fixed_iterations=ITERATIONS))
     bare = polished.with_options(polish=False)
-    backward = partial(dscp.unrolled, polished, polished.run(parameters), CostLoss())
+    backward = partial(unrolled, polished, polished.run(parameters), CostLoss())
     backward()
     parts, rounds_s = [], []
     for _ in range(rounds):
@@ -166,7 +167,7 @@ def _rollout_share(intervals: int) -> float:
     times = alternated(
         [
             partial(transcription.initial_guess_pullback, parameters, seed),
-            partial(dscp.unrolled, scp, trace, CostLoss()),
+            partial(unrolled, scp, trace, CostLoss()),
         ],
         10,
     )

@@ -10,11 +10,11 @@ import numpy as np
 from benchmarks.cases import Array, box_states
 from benchmarks.report import Cell, Report, Table
 from benchmarks.timing import clocked, median_ms, p99_ms
-from dscp_core.plan import Plan, PlanStatus
-from dscp_core.planner import Planner, PlannerSettings, TerminalTime
-from dscp_core.scp import ScpOptions
-from dscp_core.simulation import DescentRecord, simulate_descent
-from dscp_core.verification import PlanVerifier
+from dscp_core.planning.certificate import PlanVerifier
+from dscp_core.planning.plan import Plan, PlanStatus
+from dscp_core.planning.planner import Planner, PlannerSettings, TerminalTime
+from dscp_core.problems.powered_descent.simulation import DescentRecord, simulate_descent
+from dscp_core.scp.scp import ScpOptions
 
 SOLVERS = ("clarabel", "qoco,clarabel")
 TARGET_MS = 50.0

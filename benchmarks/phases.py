@@ -9,10 +9,10 @@ import numpy as np
 
 from benchmarks.report import Cell, Report, Table
 from benchmarks.timing import Array, alternated, median_ms
-from dscp_core import dscp
-from dscp_core.losses import FinalStateLoss
-from dscp_core.planner import Planner, PlannerSettings
-from dscp_core.scp import Scp, ScpOptions, ScpResult
+from dscp_core.gradients.losses import FinalStateLoss
+from dscp_core.gradients.run import implicit, unrolled
+from dscp_core.planning.planner import Planner, PlannerSettings
+from dscp_core.scp.scp import Scp, ScpOptions, ScpResult
 
 SOLVERS = {"clarabel": 1.0, "qoco": 1.0, "ecos": 0.2}
 """Solvers, and the share of the rounds that each takes part in: ECOS takes half a minute else."""
@@ -93,8 +93,8 @@ def _backward(
     }
     calls: list[Callable[[], object]] = [
         *(partial(loop.run, planner.parameters) for loop in (plain, polished, unpolished)),
-        *(partial(dscp.unrolled, polished, trace, LOSS) for trace in traces.values()),
-        partial(dscp.implicit, polished, traces["after polished forward"], LOSS),
+        *(partial(unrolled, polished, trace, LOSS) for trace in traces.values()),
+        partial(implicit, polished, traces["after polished forward"], LOSS),
     ]
     times = alternated(calls, rounds)
     rows: list[tuple[Cell, ...]] = []

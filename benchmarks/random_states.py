@@ -11,10 +11,10 @@ import numpy as np
 from benchmarks.cases import Array, box_states
 from benchmarks.report import Cell, Report, Table
 from benchmarks.timing import clocked, median_ms, p99_ms
-from dscp_core.ocp import TERMINAL_TIME
-from dscp_core.plan import PlanOutcome, PlanStatus
-from dscp_core.planner import Planner, PlannerSettings, TerminalTime
-from dscp_core.scp import ScpOptions
+from dscp_core.planning.plan import PlanOutcome, PlanStatus
+from dscp_core.planning.planner import Planner, PlannerSettings, TerminalTime
+from dscp_core.problem.declaration import TERMINAL_TIME
+from dscp_core.scp.scp import ScpOptions
 
 SOLVERS = ("clarabel", "qoco,clarabel")
 MARGIN_S = 1.0

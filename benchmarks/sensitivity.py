@@ -11,11 +11,11 @@ import numpy as np
 from benchmarks.diffcp_program import MODES, DiffcpProgram
 from benchmarks.report import Cell, Report, Table
 from benchmarks.timing import Array, alternated, clocked
-from dscp_core.cone_program import ConeValues
-from dscp_core.planner import Planner, PlannerSettings
-from dscp_core.scp import GRADIENT_TOLERANCE, Scp, ScpOptions
-from dscp_core.sensitivity import KktSystem
-from dscp_core.solvers import SOLVER_NAMES, SolverSettings, make_solver
+from dscp_core.cone.derivative.sensitivity import KktSystem
+from dscp_core.cone.program import ConeValues
+from dscp_core.cone.solvers import SOLVER_NAMES, SolverSettings, make_solver
+from dscp_core.planning.planner import Planner, PlannerSettings
+from dscp_core.scp.scp import GRADIENT_TOLERANCE, Scp, ScpOptions
 
 STEP = 1e-7
 """Of central differences, relative to every value of the program."""

@@ -14,12 +14,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from benchmarks.report import Cell, Report, Table
-from dscp_core import dscp
-from dscp_core.losses import FinalStateLoss
-from dscp_core.ocp import TERMINAL_TIME
-from dscp_core.parameters import Value
-from dscp_core.planner import Planner, PlannerSettings, TerminalTime
-from dscp_core.scp import Scp, ScpOptions
+from dscp_core.gradients.losses import FinalStateLoss
+from dscp_core.gradients.run import implicit, tangent, unrolled
+from dscp_core.planning.planner import Planner, PlannerSettings, TerminalTime
+from dscp_core.problem.declaration import TERMINAL_TIME
+from dscp_core.problem.parameters import Value
+from dscp_core.scp.scp import Scp, ScpOptions
 from tests.oracles.powered_descent_nlp import solve_free_time
 
 PAPER_OPTIMUM_S = 32.81
@@ -161,7 +161,7 @@ def _compare(
     for time_s in times_s:
         parameters = table.pack({**(changed or {}), TERMINAL_TIME: time_s}, planner.parameters)
         trace = scp.run(parameters)
-        gradient = dscp.unrolled(scp, trace, LOSS)
+        gradient = unrolled(scp, trace, LOSS)
         explicit = LOSS.gradient(planner.transcription, trace).decisions[-1]
         repeat = scp.with_options(fixed_iterations=len(trace.iterations))
         for probe in probes:
@@ -172,8 +172,8 @@ def _compare(
             ahead, behind = (
                 LOSS.value(planner.transcription, repeat.run(parameters + m)) for m in moved
             )
-            tangent = dscp.tangent(scp, trace, moved[0] / step)
-            change = tangent.decisions[-1]
+            moving = tangent(scp, trace, moved[0] / step)
+            change = moving.decisions[-1]
             found = float(gradient.parameters[place])
             size = float(np.linalg.norm(explicit) * np.linalg.norm(change))
             compared.append(
@@ -197,10 +197,10 @@ def _implicit(report: Report, planner: Planner, scp: Scp, times_s: np.ndarray) -
     place = table.slice(TERMINAL_TIME)
     for time_s in times_s:
         trace = converged.run(table.pack({TERMINAL_TIME: time_s}, planner.parameters))
-        pair = [method(converged, trace, LOSS) for method in (dscp.unrolled, dscp.implicit)]
+        pair = [method(converged, trace, LOSS) for method in (unrolled, implicit)]
         if all(gradient.trusted for gradient in pair):
-            unrolled, implicit = (float(gradient.parameters[place][0]) for gradient in pair)
-            errors.append(abs(implicit - unrolled) / abs(unrolled))
+            through, at_point = (float(gradient.parameters[place][0]) for gradient in pair)
+            errors.append(abs(at_point - through) / abs(through))
     worst = max(errors, default=float("nan"))
     label = f"implicit against unrolled, K = {CONVERGED_ITERATIONS}, {len(errors)} trusted points"
     report.add(label, worst, "1", ("<=", ERROR_BOUND))

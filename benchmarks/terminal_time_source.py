@@ -6,10 +6,10 @@ import numpy as np
 
 from benchmarks.cases import Array, box_states
 from benchmarks.report import Cell, Report, Table
-from dscp_core.plan import PlanOutcome, PlanStatus
-from dscp_core.planner import Planner, PlannerSettings, TerminalTime
-from dscp_core.scp import ScpOptions
-from dscp_core.terminal_time import TerminalTimeNetwork
+from dscp_core.planning.plan import PlanOutcome, PlanStatus
+from dscp_core.planning.planner import Planner, PlannerSettings, TerminalTime
+from dscp_core.problems.powered_descent.network import TerminalTimeNetwork
+from dscp_core.scp.scp import ScpOptions
 
 LIMITS = (1, 2, 3, 20)
 """Iterations of one start; 20 is the node's limit."""

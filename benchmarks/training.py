@@ -14,7 +14,7 @@ from typing import Any
 
 from benchmarks.report import Cell, Report, Table
 from dscp_core.learning.checkpoint import CHECKPOINT_FILE, Checkpoint
-from dscp_core.parallel import available_cores
+from dscp_core.workers.choice import available_cores
 
 VERTICAL, HORIZONTAL = 3e-4, 4e-4
 """What the paper reached: greatest relative error on its two profiles."""

@@ -14,14 +14,15 @@ from benchmarks.cases import box_states
 from benchmarks.report import Cell, Report, Table
 from benchmarks.timing import clocked
 from dscp_core import problems
-from dscp_core.parallel import ProcessEngine, available_cores
-from dscp_core.planner import PlannerSettings, TerminalTime
+from dscp_core.planning.planner import PlannerSettings, TerminalTime
 from dscp_core.tuning.choice import LossChoice
 from dscp_core.tuning.evaluator import TuningModel
 from dscp_core.tuning.objective import Objective
 from dscp_core.tuning.quantities import parse_tuned
 from dscp_core.tuning.samples import StateSet
 from dscp_core.tuning.space import SearchSpace
+from dscp_core.workers.choice import available_cores
+from dscp_core.workers.processes import ProcessEngine
 
 INTERVALS = 20
 """Few, so that ten thousand states take minutes."""

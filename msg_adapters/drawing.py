@@ -14,7 +14,7 @@ from msg_adapters.frames import Array
 from msg_adapters.stamps import stamp_from_nanoseconds
 
 if TYPE_CHECKING:
-    from dscp_core.plan import Plan
+    from dscp_core.planning.plan import Plan
 
 Colour = tuple[float, float, float, float]
 """Red, green, blue and opacity, each from 0 to 1."""

@@ -23,7 +23,7 @@ from msg_adapters.planet import planet_fixed
 from msg_adapters.stamps import stamp_from_nanoseconds
 
 if TYPE_CHECKING:
-    from dscp_core.plan import Plan
+    from dscp_core.planning.plan import Plan
 
 _TRACK_COLOUR: drawing.Colour = (0.9, 0.9, 0.2, 0.9)
 _PLANET_COLOUR: drawing.Colour = (0.2, 0.35, 0.6, 0.6)

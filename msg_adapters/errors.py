@@ -11,8 +11,8 @@ from dscp_core.errors import InvalidInputError
 class InputCode(IntEnum):
     """Why an input was refused; the hundreds follow the order in which inputs are checked.
 
-    Numbers below 100 are left to `dscp_core.planner.PlanStatus`, so that one ``code`` in a report
-    tells both apart.
+    Numbers below 100 are left to `dscp_core.planning.plan.PlanStatus`, so that one ``code`` in a
+    report tells both apart.
     """
 
     NOT_FINITE = 101

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 from msg_adapters.errors import RejectedInputError
 
 if TYPE_CHECKING:
-    from dscp_core.plan import PlanOutcome
-    from dscp_core.verification import PlanCertificate
+    from dscp_core.planning.certificate import PlanCertificate
+    from dscp_core.planning.plan import PlanOutcome
 
 
 class NodeCode(IntEnum):

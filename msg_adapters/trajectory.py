@@ -30,7 +30,7 @@ from msg_adapters.stamps import (
 )
 
 if TYPE_CHECKING:
-    from dscp_core.plan import Plan
+    from dscp_core.planning.plan import Plan
 
 
 class TrajectoryEncoder:
@@ -145,7 +145,7 @@ def plan_from_trajectory(
         RejectedInputError: NOT_FINITE, EMPTY_FRAME, WRONG_FRAME, DUPLICATE_NAME, UNKNOWN_NAME,
             MISSING_NAME, WRONG_ARRAY_LENGTH, TIME_NOT_INCREASING or INVALID_STAMP, in this order.
     """
-    from dscp_core.plan import Plan
+    from dscp_core.planning.plan import Plan
 
     for k, point in enumerate(message.points):
         for field in ("positions", "velocities", "effort"):

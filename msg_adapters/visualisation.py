@@ -34,7 +34,7 @@ from msg_adapters.path import path_message, poses_from_path
 from msg_adapters.stamps import stamp_from_nanoseconds
 
 if TYPE_CHECKING:
-    from dscp_core.plan import Plan
+    from dscp_core.planning.plan import Plan
 
 _CONE_SECTORS = 36
 _CONE_MARGIN = 1.2

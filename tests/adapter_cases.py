@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from dscp_core.plan import Plan
+from dscp_core.planning.plan import Plan
 from msg_adapters.frames import StateLayout, state_layout
 
 STATE_NAMES = ("x", "y", "z", "vx", "vy", "vz", "mass")

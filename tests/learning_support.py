@@ -15,7 +15,7 @@ import numpy as np
 from dscp_core.errors import InvalidInputError
 from dscp_core.learning.recipes import Fit, Phase, Recipe, Refinement, Supervised
 from dscp_core.learning.sampling import PAPER_BOX
-from dscp_core.terminal_time import FeatureMap, NetworkData, TerminalTimeNetwork
+from dscp_core.problems.powered_descent.network import FeatureMap, NetworkData, TerminalTimeNetwork
 
 if TYPE_CHECKING:
     from dscp_core.learning.training import TrainingSettings

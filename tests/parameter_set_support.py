@@ -16,7 +16,7 @@ from pathlib import Path
 from learning_support import network
 
 from dscp_core import problems
-from dscp_core.terminal_time import TerminalTimeNetwork, vehicle_of
+from dscp_core.problems.powered_descent.network import TerminalTimeNetwork, vehicle_of
 from dscp_ros.parameter_set import ParameterSetError, load, save
 
 OLD, NEW = {"intervals": 40}, {"intervals": 41}

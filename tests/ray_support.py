@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from dscp_core.learning.evaluator import BestTimeJob, DescentModel, Outcome
+from dscp_core.learning.evaluator import BestTimeJob, OptimumModel, Outcome
 from dscp_core.learning.sampling import PAPER_BOX
-from dscp_core.scp import ScpOptions
+from dscp_core.scp.scp import ScpOptions
 
 NODE = {"num_cpus": 1, "object_store_memory": 80 * 2**20, "include_dashboard": False}
 
@@ -72,7 +72,7 @@ class Located:
 
 def descents() -> Callable[[BestTimeJob], Located]:
     """Solves powered descents for their best time, coarsely."""
-    evaluate = DescentModel(intervals=10)()
+    evaluate = OptimumModel(intervals=10)()
     names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "RAYON_NUM_THREADS")
 
     def located(job: BestTimeJob) -> Located:

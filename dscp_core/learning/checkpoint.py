@@ -13,7 +13,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
 from dscp_core.errors import DscpError
-from dscp_core.terminal_time import replace_file
+from dscp_core.files import replace_file
 
 CHECKPOINT_FILE = "checkpoint.safetensors"
 _FORMAT = "dscp_training_checkpoint"

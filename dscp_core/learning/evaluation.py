@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dscp_core import problems
-from dscp_core.learning.evaluator import BestTimeJob, DescentModel, Job, Outcome
+from dscp_core.learning.evaluator import BestTimeJob, Job, OptimumModel, Outcome
 from dscp_core.learning.labels import (
     TRUTH,
     LabelError,
@@ -21,11 +21,11 @@ from dscp_core.learning.labels import (
 )
 from dscp_core.learning.nonlinear import NonlinearProgram
 from dscp_core.learning.run import Errors
-from dscp_core.ocp import TERMINAL_TIME
-from dscp_core.parallel import Engine
+from dscp_core.problem.declaration import TERMINAL_TIME
 from dscp_core.problems import powered_descent
-from dscp_core.scp import ScpOptions
-from dscp_core.terminal_time import FeatureMap
+from dscp_core.problems.powered_descent.network import FeatureMap
+from dscp_core.scp.scp import ScpOptions
+from dscp_core.workers.engine import Engine
 
 Array = NDArray[np.float64]
 Predict = Callable[[Array], Array]
@@ -175,7 +175,7 @@ class NonlinearCheck:
 
 def check_against_ipopt(
     engine: Engine[Job, Outcome],
-    model: DescentModel,
+    model: OptimumModel,
     states: Array,
     progress: Progress | None = None,
 ) -> NonlinearCheck:

@@ -11,14 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dscp_core import problems
-from dscp_core.dscp import DifferentiationError, unrolled
-from dscp_core.losses import FinalStateLoss
-from dscp_core.ocp import TERMINAL_TIME
-from dscp_core.parameters import Value
+from dscp_core.gradients.envelope import envelope_slope
+from dscp_core.gradients.losses import FinalStateLoss
+from dscp_core.gradients.run import DifferentiationError, unrolled
+from dscp_core.problem.declaration import TERMINAL_TIME
+from dscp_core.problem.parameters import Value
 from dscp_core.problems import powered_descent
-from dscp_core.scp import Scp, ScpOptions
-from dscp_core.trace import ScpResult, ScpStatus
-from dscp_core.transcription import Transcription
+from dscp_core.scp.scp import Scp, ScpOptions
+from dscp_core.scp.trace import ScpResult, ScpStatus
+from dscp_core.transcription.transcription import Transcription
 
 Array = NDArray[np.float64]
 
@@ -38,7 +39,7 @@ class GradientMethod(Enum):
 
 
 @dataclass(frozen=True)
-class DescentModel:
+class OptimumModel:
     """The problem whose optimum is learnt. Calling it makes a worker's evaluator.
 
     Attributes:
@@ -51,15 +52,15 @@ class DescentModel:
     formulation: str | None = None
     intervals: int = 50
 
-    def __call__(self) -> DescentEvaluator:
+    def __call__(self) -> OptimumEvaluator:
         """Compile the problem."""
-        return DescentEvaluator(self)
+        return OptimumEvaluator(self)
 
 
 class Job(Protocol):
     """One item for a worker."""
 
-    def run(self, evaluator: DescentEvaluator) -> Outcome:
+    def run(self, evaluator: OptimumEvaluator) -> Outcome:
         """Do it."""
         ...
 
@@ -127,7 +128,7 @@ class BestTimeJob:
     references: Array | None = None
     times_s: Array | None = None
 
-    def run(self, evaluator: DescentEvaluator) -> Outcome:
+    def run(self, evaluator: OptimumEvaluator) -> Outcome:
         """See `Job.run`."""
         return evaluator.evaluate(self, free=True, method=GradientMethod.NONE)
 
@@ -150,15 +151,15 @@ class GivenTimeJob:
     method: GradientMethod = GradientMethod.NONE
     references: Array | None = None
 
-    def run(self, evaluator: DescentEvaluator) -> Outcome:
+    def run(self, evaluator: OptimumEvaluator) -> Outcome:
         """See `Job.run`."""
         return evaluator.evaluate(self, free=False, method=self.method)
 
 
-class DescentEvaluator:
+class OptimumEvaluator:
     """Evaluates jobs; keeps the compiled problem between them."""
 
-    def __init__(self, model: DescentModel) -> None:
+    def __init__(self, model: OptimumModel) -> None:
         self._model = model
         self._problem = problems.get(powered_descent.NAME, model.formulation)
         self._base = self._problem.table.pack(model.parameters)
@@ -240,30 +241,3 @@ class DescentEvaluator:
                 0
             ]
             outcome.trusted[row] = gradient.trusted
-
-
-def envelope_slope(scp: Scp, trace: ScpResult) -> float:
-    """Derivative of the optimal penalised cost by the terminal time, in the cost's unit per s.
-
-    By the envelope theorem it is the partial derivative of the last subproblem's Lagrangian at
-    its solution; as accurate as the iterations have converged.
-
-    Args:
-        scp: The loop that made the trace, with a fixed terminal time.
-        trace: A converged result.
-    """
-    transcription, solution = scp.transcription, trace.iterations[-1].solution
-    reference = trace.final_reference
-    values = transcription.values(reference, trace.parameters)
-    pattern, z, y = transcription.pattern, solution.z, solution.cone_dual
-    rows, columns = pattern.q.indices, pattern.q.columns
-    cotangent = values.copy()
-    cotangent.q[:] = np.where(rows == columns, 0.5, 1.0) * z[rows] * z[columns]
-    cotangent.c[:] = z
-    cotangent.a[:] = solution.equality_dual[pattern.a.indices] * z[pattern.a.columns]
-    cotangent.b[:] = -solution.equality_dual
-    cotangent.g[:] = y[pattern.g.indices] * z[pattern.g.columns]
-    cotangent.h[:] = -y
-    pulled = transcription.values_pullback(reference, trace.parameters, cotangent)[1]
-    slope = pulled[transcription.table.slice(TERMINAL_TIME)][0]
-    return float(slope * transcription.problem.cost_scale)

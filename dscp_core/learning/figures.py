@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dscp_core.files import replace_file
 from dscp_core.learning.evaluation import Measurement
-from dscp_core.plotting import draw_panel_style
-from dscp_core.terminal_time import replace_file
+from dscp_core.planning.panels import draw_panel_style
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -35,7 +35,7 @@ _PROGRESS = (
 _NAMES = {
     "supervised": "regression",
     "refinement_fit": "DSCP rounds",
-    "descent": "DSCP descent",
+    "stochastic": "stochastic steps",
 }
 
 
@@ -53,8 +53,8 @@ def write_figure(figure: Figure, path: Path) -> None:
 def training_figure(history: Sequence[Mapping[str, Any]], title: str) -> Figure:
     """How a training went: gradient and learning rate, and validation error over wall time.
 
-    On the left as in the paper: per epoch of a descent. For the default recipe, whose fits are
-    not by gradients, the misfit per look at the validation set, and the gradient per round.
+    On the left as in the paper: per epoch of stochastic steps. For the default recipe, whose fits
+    are not by gradients, the misfit per look at the validation set, and the gradient per round.
 
     Args:
         history: Entries of the history file, at least one.

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dscp_core.cone.solvers import SolverSettings
 from dscp_core.errors import DscpError
 from dscp_core.learning.evaluator import (
     BestTimeJob,
@@ -17,9 +18,8 @@ from dscp_core.learning.evaluator import (
     Job,
     Outcome,
 )
-from dscp_core.parallel import Engine
-from dscp_core.scp import ScpOptions
-from dscp_core.solvers import SolverSettings
+from dscp_core.scp.scp import ScpOptions
+from dscp_core.workers.engine import Engine
 
 Array = NDArray[np.float64]
 Progress = Callable[[int], object]

@@ -13,17 +13,17 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from dscp_core.layout import TrajectoryLayout
-from dscp_core.ocp import (
+from dscp_core.problem.declaration import (
     TERMINAL_TIME,
     ConeConstraint,
     Constraint,
     OptimalControlProblem,
     StagePoint,
     Where,
+    named,
 )
-from dscp_core.stages import named
-from dscp_core.transcription import Transcription
+from dscp_core.transcription.layout import TrajectoryLayout
+from dscp_core.transcription.transcription import Transcription
 
 Array = NDArray[np.float64]
 

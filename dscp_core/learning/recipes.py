@@ -10,8 +10,8 @@ from typing import Any
 from dscp_core.errors import InvalidInputError
 from dscp_core.learning.evaluator import GradientMethod
 from dscp_core.learning.sampling import Mixture
-from dscp_core.parameters import Value
-from dscp_core.terminal_time import FeatureMap
+from dscp_core.problem.parameters import Value
+from dscp_core.problems.powered_descent.network import FeatureMap
 
 
 @dataclass(frozen=True)
@@ -98,8 +98,8 @@ class Refinement:
 
 
 @dataclass(frozen=True)
-class Descent:
-    """Stochastic gradient descent on DSCP gradients.
+class StochasticSteps:
+    """Stochastic gradient steps on DSCP gradients.
 
     Attributes:
         epochs: Number of epochs.
@@ -145,7 +145,7 @@ class Recipe:
         profile_points: Points per axis of the paper's two profiles, whose errors are recorded.
         supervised: First stage, or None.
         refinement: Second stage, or None.
-        descent: Third stage, or None.
+        stochastic: Third stage, or None.
         parameters: Algorithm parameters that differ from the defaults.
     """
 
@@ -159,12 +159,12 @@ class Recipe:
     profile_points: int = 7
     supervised: Supervised | None = None
     refinement: Refinement | None = None
-    descent: Descent | None = None
+    stochastic: StochasticSteps | None = None
     # The thrust's mean over an interval may not fall below its minimum at all.
     parameters: Mapping[str, Value] = field(default_factory=lambda: {"mean_thrust_fraction": 1.0})
 
     def __post_init__(self) -> None:
-        if not (self.supervised or self.refinement or self.descent):
+        if not (self.supervised or self.refinement or self.stochastic):
             raise InvalidInputError("recipe", self.name, "at least one stage")
 
     def document(self) -> dict[str, Any]:
@@ -186,7 +186,7 @@ RECIPES: dict[str, Recipe] = {
         interval_s=(31.0, 37.0),
         widening=0.0,
         mixture=Mixture(),
-        descent=Descent(),
+        stochastic=StochasticSteps(),
         parameters={},
     ),
 }
@@ -218,17 +218,17 @@ def adjusted(
         labels: States of the supervised stage, in one phase; 0 leaves the stage out.
         steps: Steps of each fit.
         rounds: Rounds of the refinement; 0 leaves the stage out.
-        epochs: Epochs of the descent.
+        epochs: Epochs of the stochastic steps.
 
     Raises:
         InvalidInputError: A number below its least value, or one of a stage that is not there.
     """
-    supervised, refinement, descent = base.supervised, base.refinement, base.descent
+    supervised, refinement, stochastic = base.supervised, base.refinement, base.stochastic
     for name, value, stage, least in (
         ("labels", labels, supervised, 0),
         ("steps", steps, supervised, 1),
         ("rounds", rounds, refinement, 0),
-        ("epochs", epochs, descent, 1),
+        ("epochs", epochs, stochastic, 1),
     ):
         if value is not None and stage is None:
             raise InvalidInputError(name, value, f"no number: recipe {base.name} has none")
@@ -244,11 +244,11 @@ def adjusted(
         fit = refinement.fit if steps is None else replace(refinement.fit, steps=steps)
         kept = refinement.rounds if rounds is None else rounds
         refinement = replace(refinement, rounds=kept, fit=fit)
-    if descent is not None and epochs is not None:
-        descent = replace(descent, epochs=epochs)
+    if stochastic is not None and epochs is not None:
+        stochastic = replace(stochastic, epochs=epochs)
     return replace(
         base,
         supervised=None if labels == 0 else supervised,
         refinement=None if rounds == 0 else refinement,
-        descent=descent,
+        stochastic=stochastic,
     )

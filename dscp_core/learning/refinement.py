@@ -10,7 +10,7 @@ from dscp_core.learning.labels import Progress, given_times
 from dscp_core.learning.recipes import Refinement
 from dscp_core.learning.run import Run, TrainingError
 from dscp_core.learning.supervised import fit_targets, label_targets, targets
-from dscp_core.scp import ScpOptions
+from dscp_core.scp.scp import ScpOptions
 
 Array = NDArray[np.float64]
 

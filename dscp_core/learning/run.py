@@ -27,7 +27,7 @@ from dscp_core.learning.sampling import (
     horizontal_profile,
     vertical_profile,
 )
-from dscp_core.parallel import Engine
+from dscp_core.workers.engine import Engine
 
 Array = NDArray[np.float64]
 
@@ -44,7 +44,7 @@ _PURPOSES = (
     "supervised",
     "refinement",
     "refinement_fit",
-    "descent",
+    "stochastic",
 )
 
 

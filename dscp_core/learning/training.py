@@ -13,18 +13,19 @@ import torch
 
 from dscp_core import problems
 from dscp_core.errors import InvalidInputError
+from dscp_core.files import replace_file
 from dscp_core.learning.checkpoint import CHECKPOINT_FILE, CheckpointError
-from dscp_core.learning.descent import descend
-from dscp_core.learning.evaluator import DescentModel
+from dscp_core.learning.evaluator import OptimumModel
 from dscp_core.learning.recipes import Recipe
 from dscp_core.learning.refinement import refine
 from dscp_core.learning.run import Errors, Run, stage
 from dscp_core.learning.sampling import PAPER_BOX
+from dscp_core.learning.stochastic import take_stochastic_steps
 from dscp_core.learning.supervised import supervise
-from dscp_core.parallel import make_engine
-from dscp_core.parameters import Value
+from dscp_core.problem.parameters import Value
 from dscp_core.problems import powered_descent
-from dscp_core.terminal_time import FeatureMap, TerminalTimeNetwork, replace_file, vehicle_of
+from dscp_core.problems.powered_descent.network import FeatureMap, TerminalTimeNetwork, vehicle_of
+from dscp_core.workers.choice import make_engine
 
 NETWORK_FILE = "terminal_time.safetensors"
 HISTORY_FILE = "history.json"
@@ -102,7 +103,7 @@ def train(settings: TrainingSettings) -> TrainingResult:
         raise CheckpointError(f"{path} exists: resume that training, or choose another folder")
     # Two threads add up in another order than one: results would depend on the machine.
     torch.set_num_threads(1)
-    model = DescentModel(parameters=parameters, intervals=settings.intervals)
+    model = OptimumModel(parameters=parameters, intervals=settings.intervals)
     engine = make_engine(model, settings.workers, settings.ray_address)
     try:
         run = Run(
@@ -142,8 +143,8 @@ def _require_symmetry(values: Mapping[str, Any]) -> None:
 def _stages(run: Run) -> None:
     run.ensure_truth()
     stage(run, "supervised", "refinement", supervise)
-    stage(run, "refinement", "descent", refine)
-    stage(run, "descent", "done", descend)
+    stage(run, "refinement", "stochastic", refine)
+    stage(run, "stochastic", "done", take_stochastic_steps)
 
 
 def _finish(

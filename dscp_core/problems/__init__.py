@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from dscp_core.errors import InvalidInputError
-from dscp_core.ocp import OptimalControlProblem
+from dscp_core.problem.declaration import OptimalControlProblem
 from dscp_core.problems import entry, powered_descent
 
 _PROBLEMS: dict[str, Callable[[str], OptimalControlProblem]] = {

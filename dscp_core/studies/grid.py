@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 from dscp_core.errors import DscpError
-from dscp_core.parallel import Engine
+from dscp_core.workers.engine import Engine
 
 Item: TypeAlias = tuple[str | int | float, ...]
 Row: TypeAlias = Mapping[str, Any]

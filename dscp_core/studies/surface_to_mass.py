@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicHermiteSpline
 
-from dscp_core import dscp
 from dscp_core.errors import InvalidInputError
-from dscp_core.losses import CostLoss
-from dscp_core.studies.differences import RunDifferences, relative_error
+from dscp_core.gradients.differences import RunDifferences, relative_error
+from dscp_core.gradients.losses import CostLoss
+from dscp_core.gradients.run import DifferentiationError, Gradient, unrolled
 from dscp_core.studies.grid import Item, Row
 from dscp_core.studies.trust_region_cases import (
     CASES,
@@ -137,8 +137,8 @@ def _point(runs: EntryRuns, log_weights: tuple[float, float], ratio: float) -> d
         "relative_error": None,
     }
     try:
-        gradient = dscp.unrolled(scp, trace, CostLoss())
-    except dscp.DifferentiationError:
+        gradient = unrolled(scp, trace, CostLoss())
+    except DifferentiationError:
         return row
     slope = _by_ratio(runs, gradient)
     difference = RunDifferences(scp, trace, CostLoss()).derivative(
@@ -158,7 +158,7 @@ def _point(runs: EntryRuns, log_weights: tuple[float, float], ratio: float) -> d
     }
 
 
-def _by_ratio(runs: EntryRuns, gradient: dscp.Gradient) -> float:
+def _by_ratio(runs: EntryRuns, gradient: Gradient) -> float:
     return float(gradient.parameters[runs.transcription.table.slice(PARAMETER)][0])
 
 
@@ -175,8 +175,8 @@ def _descend(runs: EntryRuns, log_weights: tuple[float, float]) -> dict[str, Any
     for _ in range(_MOST_STEPS):
         trace = scp.run(runs.parameters(log_weights, ratio))
         try:
-            gradient = dscp.unrolled(scp, trace, CostLoss())
-        except dscp.DifferentiationError:
+            gradient = unrolled(scp, trace, CostLoss())
+        except DifferentiationError:
             break  # the steps so far are the result
         steps.append(
             {"ratio": ratio, "cost": gradient.value, "gradient": _by_ratio(runs, gradient)}

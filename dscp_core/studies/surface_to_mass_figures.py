@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from dscp_core.plotting import draw_panel_style
+from dscp_core.planning.panels import draw_panel_style
 from dscp_core.studies.grid import Item, Row
 from dscp_core.studies.surface_to_mass import (
     PAPER,

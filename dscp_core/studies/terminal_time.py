@@ -10,15 +10,16 @@ from statistics import fmean, median
 
 import numpy as np
 
-from dscp_core import dscp, problems
+from dscp_core import problems
 from dscp_core.errors import InvalidInputError
-from dscp_core.losses import FinalStateLoss
-from dscp_core.ocp import TERMINAL_TIME
-from dscp_core.parallel import make_engine
-from dscp_core.plan import PlanStatus
-from dscp_core.planner import Planner, PlannerSettings, TerminalTime
-from dscp_core.scp import ScpOptions, ScpStatus
-from dscp_core.studies.differences import RunDifferences, relative_error
+from dscp_core.gradients.differences import RunDifferences, relative_error
+from dscp_core.gradients.losses import FinalStateLoss
+from dscp_core.gradients.run import DifferentiationError, unrolled
+from dscp_core.planning.plan import PlanStatus
+from dscp_core.planning.planner import Planner, PlannerSettings, TerminalTime
+from dscp_core.problem.declaration import TERMINAL_TIME
+from dscp_core.scp.scp import ScpOptions, ScpStatus
+from dscp_core.workers.choice import make_engine
 
 PAPER_OPTIMUM_S = 32.81
 """Optimal terminal time that section 4.1.2 of the paper reports."""
@@ -258,8 +259,8 @@ def _point(planner: Planner, time_s: float) -> SweepPoint:
         reasons=(trace.message,),
     )
     try:
-        gradient = dscp.unrolled(scp, trace, _LOSS)
-    except dscp.DifferentiationError:
+        gradient = unrolled(scp, trace, _LOSS)
+    except DifferentiationError:
         return point
     slope = float(gradient.parameters[table.slice(TERMINAL_TIME)][0])
     difference = RunDifferences(scp, trace, _LOSS).derivative(TERMINAL_TIME)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from dscp_core.plotting import FLOWN, LIMIT, PLANNED, draw_panel_style
+from dscp_core.planning.panels import FLOWN, LIMIT, PLANNED, draw_panel_style
 from dscp_core.studies.terminal_time import SweepPoint, SweepSummary
 
 if TYPE_CHECKING:

@@ -14,10 +14,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dscp_core import dscp
 from dscp_core.errors import InvalidInputError
-from dscp_core.losses import ConvergenceLoss, LogConvergenceLoss
+from dscp_core.gradients.losses import ConvergenceLoss, LogConvergenceLoss
+from dscp_core.gradients.run import DifferentiationError, Gradient, unrolled
 from dscp_core.problems.entry import physics
+from dscp_core.scp.trace import ScpResult, ScpStatus
 from dscp_core.studies.grid import Item, Row
 from dscp_core.studies.trust_region_cases import (
     CASES,
@@ -25,7 +26,6 @@ from dscp_core.studies.trust_region_cases import (
     MOST_ITERATIONS,
     EntryRuns,
 )
-from dscp_core.trace import ScpResult, ScpStatus
 
 Array = NDArray[np.float64]
 
@@ -110,8 +110,8 @@ class _Evaluator:
             "max_defect": None,
         }
         try:
-            gradient = dscp.unrolled(scp, trace, ConvergenceLoss())
-        except dscp.DifferentiationError:
+            gradient = unrolled(scp, trace, ConvergenceLoss())
+        except DifferentiationError:
             return trace, row
         slopes = self._runs.weight_gradient(gradient.parameters, log_weights)
         return trace, {
@@ -172,8 +172,8 @@ class _Evaluator:
             log_weights = (float(place[0]), float(place[1]))
             trace = scp.run(self._runs.parameters(log_weights))
             try:
-                gradient = dscp.unrolled(scp, trace, loss)
-            except dscp.DifferentiationError:
+                gradient = unrolled(scp, trace, loss)
+            except DifferentiationError:
                 break  # the steps so far are the result
             slope = self._runs.weight_gradient(gradient.parameters, log_weights)
             steps.append(self._step(log_weights, trace, gradient, slope))
@@ -188,7 +188,7 @@ class _Evaluator:
         self,
         log_weights: tuple[float, float],
         trace: ScpResult,
-        gradient: dscp.Gradient,
+        gradient: Gradient,
         slope: Array,
     ) -> dict[str, Any]:
         flyable = self._runs.iterations_needed(trace, flyable=True)

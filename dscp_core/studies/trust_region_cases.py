@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dscp_core import problems
-from dscp_core.scp import Scp, ScpOptions, StoppingRule
-from dscp_core.trace import Iteration, ScpResult
-from dscp_core.transcription import Transcription
+from dscp_core.scp.scp import Scp, ScpOptions, StoppingRule
+from dscp_core.scp.trace import Iteration, ScpResult
+from dscp_core.transcription.transcription import Transcription
 
 Array = NDArray[np.float64]
 

@@ -22,7 +22,7 @@ class Evaluation:
 
     Attributes:
         loss: (n,) what the set is judged by; NaN where there is none.
-        descended: (n,) what has a derivative; the same, unless iterations are counted.
+        differentiated: (n,) what has a derivative; the same, unless iterations are counted.
         iterations: (n,).
         failed: (n,) without a certified plan.
         trusted: (n,) with a gradient that can be relied upon, where that was asked for.
@@ -31,7 +31,7 @@ class Evaluation:
     """
 
     loss: Array
-    descended: Array
+    differentiated: Array
     iterations: NDArray[np.intp]
     failed: Flags
     trusted: Flags
@@ -59,7 +59,7 @@ class Evaluation:
         judged = np.where(np.isfinite(loss), iterations, math.nan) if counts_iterations else loss
         return Evaluation(
             loss=judged,
-            descended=loss,
+            differentiated=loss,
             iterations=iterations,
             failed=joined("failed"),
             trusted=~joined("untrusted"),
@@ -115,11 +115,11 @@ def better(old: Evaluation, new: Evaluation) -> bool:
 
     It must not fail on more states; and have a lower mean loss on the states where both have one,
     or fail on fewer states without a higher loss. Equal numbers of iterations are told apart by
-    what was descended.
+    what was differentiated.
     """
     if new.failures > old.failures:
         return False
-    change = _change(old.loss, new.loss) or _change(old.descended, new.descended)
+    change = _change(old.loss, new.loss) or _change(old.differentiated, new.differentiated)
     return change < 0.0 or (new.failures < old.failures and change <= 0.0)
 
 

@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
 from dscp_core.errors import InvalidInputError
-from dscp_core.losses import CostLoss, FinalStateLoss, LogConvergenceLoss, Loss
-from dscp_core.ocp import OptimalControlProblem
-from dscp_core.planner import PlannerSettings
-from dscp_core.transcription import Transcription
+from dscp_core.gradients.losses import CostLoss, FinalStateLoss, LogConvergenceLoss, Loss
+from dscp_core.planning.planner import PlannerSettings
+from dscp_core.problem.declaration import OptimalControlProblem, named
+from dscp_core.transcription.transcription import Transcription
 from dscp_core.tuning.rollout import MissLoss
 from dscp_core.tuning.user_function import UserFunction
+
+Array = NDArray[np.float64]
 
 FUEL, COST, CONVERGENCE, ITERATIONS, MISS = "fuel", "cost", "convergence", "iterations", "miss"
 LOSSES = (FUEL, COST, CONVERGENCE, ITERATIONS, MISS)
@@ -84,3 +91,30 @@ class LossChoice:
         if self.is_fuel(problem):
             return FinalStateLoss(_MASS, -1.0)
         return CostLoss()
+
+
+def cost_is_minus_mass(
+    problem: OptimalControlProblem, parameters: Array, tuned: Sequence[int]
+) -> bool:
+    """Whether the cost is minus the final mass, whatever the tuned parameters are.
+
+    Args:
+        problem: The declaration.
+        parameters: (P,) packed, SI.
+        tuned: Indices of those that may change.
+    """
+    names = [s.name for s in problem.states]
+    if _MASS not in names or problem.running_cost is not None:
+        return False
+    x, time = ca.SX.sym("x", len(names)), ca.SX.sym("t")
+    packed = ca.SX.sym("p", problem.table.size)
+    cost = problem.terminal_cost(x, time, named(problem, packed))
+    rest = cost + x[names.index(_MASS)]
+    changing = ca.vertcat(x, time, *(packed[index] for index in tuned))
+    slopes = ca.Function("slopes", [x, time, packed], [ca.jacobian(rest, changing)])
+    random = np.random.default_rng(0)
+    scale = np.array([s.scale for s in problem.states])
+    return all(
+        np.all(np.array(slopes(scale * random.normal(size=scale.size), 10.0, parameters)) == 0.0)
+        for _ in range(3)
+    )

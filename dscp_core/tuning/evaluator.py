@@ -1,4 +1,4 @@
-"""What a worker does with logged states: gradients for the descent, plans for the judgement."""
+"""What a worker does with logged states: gradients for the search, plans for the judgement."""
 
 from __future__ import annotations
 
@@ -11,16 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dscp_core import problems
-from dscp_core.dscp import DifferentiationError, unrolled
-from dscp_core.learning.evaluator import envelope_slope
-from dscp_core.ocp import TERMINAL_TIME, OptimalControlProblem
-from dscp_core.planner import PlannerSettings, TerminalTime
-from dscp_core.scp import GRADIENT_TOLERANCE, Scp, ScpOptions, ScpResult, ScpStatus
-from dscp_core.solvers import SolverSettings
-from dscp_core.transcription import Transcription
+from dscp_core.cone.solvers import SolverSettings
+from dscp_core.gradients.envelope import envelope_gradient, envelope_slope
+from dscp_core.gradients.run import DifferentiationError, unrolled
+from dscp_core.planning.certificate import PlanVerifier
+from dscp_core.planning.planner import PlannerSettings, TerminalTime
+from dscp_core.problem.declaration import TERMINAL_TIME, OptimalControlProblem
+from dscp_core.scp.scp import GRADIENT_TOLERANCE, Scp, ScpOptions, ScpResult, ScpStatus
+from dscp_core.transcription.transcription import Transcription
 from dscp_core.tuning.choice import LossChoice
-from dscp_core.tuning.envelope import envelope_gradient
-from dscp_core.verification import PlanVerifier
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from dscp_core.learning.network_torch import TorchNetwork
-from dscp_core.terminal_time import NetworkData, TerminalTimeNetwork, vehicle_of
+from dscp_core.problems.powered_descent.network import NetworkData, TerminalTimeNetwork, vehicle_of
 
 
 def trainable(data: NetworkData) -> TorchNetwork:

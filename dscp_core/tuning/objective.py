@@ -11,12 +11,12 @@ import torch
 from numpy.typing import NDArray
 
 from dscp_core.learning.network_torch import TorchNetwork
-from dscp_core.ocp import TERMINAL_TIME, OptimalControlProblem
-from dscp_core.parallel import Engine
+from dscp_core.problem.declaration import TERMINAL_TIME, OptimalControlProblem
 from dscp_core.tuning.evaluator import CHUNK, GradientJob, Gradients, Job, PlanJob, Plans
 from dscp_core.tuning.references import ReferenceStore
 from dscp_core.tuning.samples import StateSet
 from dscp_core.tuning.space import SearchSpace
+from dscp_core.workers.engine import Engine
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.intp]

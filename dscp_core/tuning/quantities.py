@@ -10,14 +10,14 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from dscp_core.errors import InvalidInputError
-from dscp_core.ocp import (
+from dscp_core.problem.declaration import (
     TRUST_REGION_CONTROL,
     TRUST_REGION_STATE,
     TRUST_REGION_STEP,
     VIRTUAL_CONTROL_WEIGHT,
     OptimalControlProblem,
 )
-from dscp_core.parameters import Parameter, Value
+from dscp_core.problem.parameters import Parameter, Value
 
 NETWORK = "network"
 WEIGHTS = (

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dscp_core import problems
-from dscp_core.planner import PlannerSettings, TerminalTime
-from dscp_core.terminal_time import FileWriteError
+from dscp_core.files import FileWriteError
+from dscp_core.planning.planner import PlannerSettings, TerminalTime
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.intp]

@@ -6,14 +6,13 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from dscp_core.compiled import CompiledFunction
 from dscp_core.errors import InvalidInputError
-from dscp_core.losses import LossGradient
-from dscp_core.ocp import TERMINAL_TIME
-from dscp_core.scp import ScpResult
-from dscp_core.stages import named
-from dscp_core.transcription import Transcription
-from dscp_core.verification import ControlHold
+from dscp_core.gradients.losses import LossGradient
+from dscp_core.planning.certificate import ControlHold
+from dscp_core.problem.declaration import TERMINAL_TIME, named
+from dscp_core.scp.scp import ScpResult
+from dscp_core.transcription.compiled import CompiledFunction
+from dscp_core.transcription.transcription import Transcription
 
 Array = NDArray[np.float64]
 
@@ -23,7 +22,7 @@ class MissLoss:
 
     The true dynamics are flown from the first node under the planned controls by the classical
     Runge-Kutta method; a certificate flies them independently, with error control. See
-    `dscp_core.losses.Loss`.
+    `dscp_core.gradients.losses.Loss`.
     """
 
     def __init__(

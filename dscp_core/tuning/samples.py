@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from dscp_core import problems
 from dscp_core.errors import InvalidInputError
-from dscp_core.ocp import TERMINAL_TIME, OptimalControlProblem
-from dscp_core.planner import TerminalTime
-from dscp_core.terminal_time import TerminalTimeNetwork
+from dscp_core.planning.planner import TerminalTime
+from dscp_core.problem.declaration import TERMINAL_TIME, OptimalControlProblem
+from dscp_core.problems.powered_descent.network import TerminalTimeNetwork
 from dscp_core.tuning.settings import Sample, TuningSettings
 
 Array = NDArray[np.float64]

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dscp_core.errors import InvalidInputError
-from dscp_core.planner import PlannerSettings
+from dscp_core.planning.planner import PlannerSettings
 from dscp_core.tuning.quantities import TunedParameter
 
 Array = NDArray[np.float64]

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dscp_core.errors import InvalidInputError
-from dscp_core.ocp import OptimalControlProblem
+from dscp_core.problem.declaration import OptimalControlProblem
 from dscp_core.tuning.quantities import (
     DEFAULT_WEIGHT_START,
     WEIGHTS,

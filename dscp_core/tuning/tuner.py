@@ -17,14 +17,11 @@ from tqdm import tqdm
 from dscp_core import problems
 from dscp_core.errors import InvalidInputError
 from dscp_core.learning.checkpoint import CheckpointError
-from dscp_core.ocp import TERMINAL_TIME, OptimalControlProblem
-from dscp_core.parallel import make_engine
-from dscp_core.planner import TerminalTime
-from dscp_core.terminal_time import TerminalTimeNetwork
+from dscp_core.planning.planner import TerminalTime
+from dscp_core.problem.declaration import TERMINAL_TIME, OptimalControlProblem
+from dscp_core.problems.powered_descent.network import TerminalTimeNetwork
 from dscp_core.tuning.assessment import Evaluation, improved
-from dscp_core.tuning.choice import LossChoice
-from dscp_core.tuning.descent import Descent, checkpoint_path
-from dscp_core.tuning.envelope import cost_is_minus_mass
+from dscp_core.tuning.choice import LossChoice, cost_is_minus_mass
 from dscp_core.tuning.errors import TuningError
 from dscp_core.tuning.evaluator import TuningModel
 from dscp_core.tuning.network import exported, trainable
@@ -32,8 +29,10 @@ from dscp_core.tuning.objective import Objective
 from dscp_core.tuning.quantities import NETWORK, WEIGHTS, check_corners, components
 from dscp_core.tuning.references import ReferenceStore, reference_files, reference_size
 from dscp_core.tuning.samples import Refusal, StateSet, screen
+from dscp_core.tuning.search import Search, checkpoint_path
 from dscp_core.tuning.settings import Sample, TuningSettings
 from dscp_core.tuning.space import SearchSpace
+from dscp_core.workers.choice import make_engine
 
 Array = NDArray[np.float64]
 
@@ -132,7 +131,7 @@ def tune(
         objective = Objective(
             problem, engine, space, predictor, tunes_network=settings.tunes_network
         )
-        descent = Descent(
+        search = Search(
             settings,
             objective,
             states,
@@ -141,15 +140,15 @@ def tune(
             store=ReferenceStore(settings.output, reference_size(planner)) if warm else None,
         )
         if settings.resume:
-            descent.resume()
-        descent.search()
-        tuned = space.packed(descent.use_best())
+            search.resume()
+        search.search()
+        tuned = space.packed(search.use_best())
         after = _evaluate(settings, objective, tuned, judged, loss, "after")
         objective.network = None if network is None else trainable(network.data)
         before = _evaluate(settings, objective, base, judged, loss, "before")
     finally:
         engine.close()
-    document = descent.document
+    document = search.document
     return TuningResult(
         values=_changed(problem, base, tuned),
         network=_tuned_network(settings, problem, tuned, predictor, network, identity),
@@ -160,7 +159,7 @@ def tune(
         refused=(*refused, *also_refused),
         best_epoch=document["best_epoch"],
         notes=(*space.notes, *([document["stopped"]] if "stopped" in document else [])),
-        elapsed_s=descent.elapsed_s,
+        elapsed_s=search.elapsed_s,
     )
 
 

@@ -8,10 +8,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from dscp_core.losses import LossGradient
-from dscp_core.ocp import TERMINAL_TIME
-from dscp_core.scp import ScpResult
-from dscp_core.transcription import Transcription
+from dscp_core.gradients.losses import LossGradient
+from dscp_core.problem.declaration import TERMINAL_TIME
+from dscp_core.scp.scp import ScpResult
+from dscp_core.transcription.transcription import Transcription
 from dscp_core.tuning.errors import TuningError
 from dscp_core.tuning.user_function import UserFunction
 
@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 
 
 class UserLoss:
-    """Loss of the final trajectory by the user's function; see `dscp_core.losses.Loss`.
+    """Loss of the final trajectory by the user's function; see `dscp_core.gradients.losses.Loss`.
 
     The function is called with states (N+1, nx), controls (N+1, nu) and the terminal time (), SI,
     double precision, and returns a scalar that autograd can differentiate.

@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING, Any
 from dscp_core.errors import InvalidInputError
 
 if TYPE_CHECKING:
-    from dscp_core.ocp import OptimalControlProblem
-    from dscp_core.parameters import Parameter, Value
-    from dscp_core.planner import PlannerSettings
-    from dscp_core.scp import ScpOptions
+    from dscp_core.planning.planner import PlannerSettings
+    from dscp_core.problem.declaration import OptimalControlProblem
+    from dscp_core.problem.parameters import Parameter, Value
+    from dscp_core.scp.scp import ScpOptions
 
 # Beyond this, memory and time grow without a visible gain in accuracy.
 MOST_INTERVALS = 2000
@@ -103,7 +103,7 @@ def overrides(
     Raises:
         InvalidInputError: A file that cannot be read, or an assignment that cannot be parsed.
     """
-    from dscp_core.parameters import load_parameter_file
+    from dscp_core.problem.parameters import load_parameter_file
 
     assigned = parse_assignments(args.assignments)
     if args.vehicle is None:
@@ -146,7 +146,7 @@ def planner_settings(args: argparse.Namespace, options: ScpOptions) -> PlannerSe
     from dataclasses import replace
 
     from dscp_core import problems
-    from dscp_core.planner import PlannerSettings, TerminalTime
+    from dscp_core.planning.planner import PlannerSettings, TerminalTime
 
     problem = problems.get(args.problem, args.formulation)
     intervals = problem.default_intervals if args.intervals is None else args.intervals

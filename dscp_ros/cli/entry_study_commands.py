@@ -191,8 +191,8 @@ def _compute(
         raise InvalidInputError("--output", str(args.output), "a directory")
     from tqdm import tqdm
 
-    from dscp_core.parallel import make_engine
     from dscp_core.studies.grid import code_version, discard, run_grid
+    from dscp_core.workers.choice import make_engine
 
     path = args.output / name
     if args.restart:

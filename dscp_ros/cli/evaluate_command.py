@@ -16,9 +16,9 @@ from dscp_ros.cli.arguments import overrides, print_json, print_table
 
 if TYPE_CHECKING:
     from dscp_core.learning.evaluation import Measurement
-    from dscp_core.learning.evaluator import DescentModel, Job, Outcome
-    from dscp_core.parallel import Engine
-    from dscp_core.terminal_time import TerminalTimeNetwork
+    from dscp_core.learning.evaluator import Job, OptimumModel, Outcome
+    from dscp_core.problems.powered_descent.network import TerminalTimeNetwork
+    from dscp_core.workers.engine import Engine
 
 DESCRIPTION = "Measures what was learnt against brute force."
 
@@ -131,10 +131,10 @@ def run_terminal_time(args: argparse.Namespace) -> int:
     if args.output is not None and args.output.exists() and not args.output.is_dir():
         raise InvalidInputError("--output", str(args.output), "a directory")
     from dscp_core import problems
-    from dscp_core.learning.evaluator import DescentModel
-    from dscp_core.parallel import make_engine
+    from dscp_core.learning.evaluator import OptimumModel
     from dscp_core.problems import powered_descent
-    from dscp_core.terminal_time import DEFAULT_NETWORK, TerminalTimeNetwork
+    from dscp_core.problems.powered_descent.network import DEFAULT_NETWORK, TerminalTimeNetwork
+    from dscp_core.workers.choice import make_engine
 
     table = problems.get(powered_descent.NAME).table
     parameters = overrides(args)
@@ -142,7 +142,7 @@ def run_terminal_time(args: argparse.Namespace) -> int:
         DEFAULT_NETWORK if args.network is None else args.network,
         vehicle=table.unpack(table.pack(parameters)),
     )
-    model = DescentModel({**parameters, "mean_thrust_fraction": 1.0}, None, network.data.intervals)
+    model = OptimumModel({**parameters, "mean_thrust_fraction": 1.0}, None, network.data.intervals)
     rng = np.random.default_rng(args.seed)
     engine = make_engine(model, args.workers, args.ray)
     try:
@@ -172,7 +172,7 @@ def _measure(
     """Errors and fuel on every set."""
     from dscp_core.learning import evaluation
     from dscp_core.learning.sampling import PAPER_BOX, horizontal_profile, vertical_profile
-    from dscp_core.terminal_time import FeatureMap
+    from dscp_core.problems.powered_descent.network import FeatureMap
 
     sets = {
         "vertical": vertical_profile(PROFILE_POINTS),
@@ -197,7 +197,7 @@ def _check(
     args: argparse.Namespace,
     engine: Engine[Job, Outcome],
     network: TerminalTimeNetwork,
-    model: DescentModel,
+    model: OptimumModel,
     rng: np.random.Generator,
 ) -> dict[str, Any]:
     """Feasibility of many predictions, and optimal times against IPOPT."""

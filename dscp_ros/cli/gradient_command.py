@@ -112,8 +112,8 @@ def run(args: argparse.Namespace) -> int:
         print_parameters(args)
         return ExitCode.OK
     _require(args)
-    from dscp_core.planner import Planner
-    from dscp_core.scp import ScpOptions
+    from dscp_core.planning.planner import Planner
+    from dscp_core.scp.scp import ScpOptions
     from dscp_ros.cli.gradient_report import check, differentiate
 
     fixed = args.iterations

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from dscp_core import dscp
-from dscp_core.losses import ConvergenceLoss, CostLoss, FinalStateLoss, Loss
-from dscp_core.scp import Scp, ScpResult, ScpStatus
-from dscp_core.studies.differences import Difference, RunDifferences, relative_error
+from dscp_core.gradients.differences import Difference, RunDifferences, relative_error
+from dscp_core.gradients.losses import ConvergenceLoss, CostLoss, FinalStateLoss, Loss
+from dscp_core.gradients.run import DifferentiationError, implicit, unrolled
+from dscp_core.scp.scp import Scp, ScpResult, ScpStatus
 
 LOSSES: dict[str, Loss] = {
     "final_mass": FinalStateLoss("mass", 1.0),
@@ -167,10 +167,10 @@ def differentiate(
         reasons=(),
         parameters=(),
     )
-    compute = dscp.unrolled if method == "unrolled" else dscp.implicit
+    compute = unrolled if method == "unrolled" else implicit
     try:
         gradient = compute(scp, trace, LOSSES[of])
-    except dscp.DifferentiationError as error:
+    except DifferentiationError as error:
         return replace(report, infeasible=True, reasons=(str(error),))
     reasons = gradient.reasons
     if infeasible:

@@ -14,8 +14,8 @@ from dscp_core.errors import InvalidInputError
 from dscp_ros.cli.arguments import json_ready
 
 if TYPE_CHECKING:
-    from dscp_core.ocp import OptimalControlProblem
-    from dscp_core.plan import Plan
+    from dscp_core.planning.plan import Plan
+    from dscp_core.problem.declaration import OptimalControlProblem
 
 
 def check_output_path(option: str, path: Path, suffixes: tuple[str, ...]) -> None:

@@ -21,9 +21,9 @@ from dscp_ros.cli.arguments import (
 from dscp_ros.cli.output_files import check_output_path, complete_file, write_trajectory
 
 if TYPE_CHECKING:
-    from dscp_core.plan import Plan, PlanOutcome
-    from dscp_core.planner import Planner
-    from dscp_core.verification import PlanCertificate
+    from dscp_core.planning.certificate import PlanCertificate
+    from dscp_core.planning.plan import Plan, PlanOutcome
+    from dscp_core.planning.planner import Planner
 
 DESCRIPTION = """\
 Plans one trajectory and certifies it: the true dynamics are integrated under the planned controls,
@@ -95,9 +95,9 @@ def run(args: argparse.Namespace) -> int:
         print_parameters(args)
         return ExitCode.OK
     _check(args)
-    from dscp_core.plan import PlanStatus
-    from dscp_core.planner import Planner, TerminalTime
-    from dscp_core.scp import ScpOptions
+    from dscp_core.planning.plan import PlanStatus
+    from dscp_core.planning.planner import Planner, TerminalTime
+    from dscp_core.scp.scp import ScpOptions
 
     planner = Planner(planner_settings(args, ScpOptions()))
     planner.check_state(planner.initial_state)
@@ -125,7 +125,7 @@ def describe(planner: Planner, outcome: PlanOutcome, least_s: float | None) -> d
         least_s: Least feasible terminal time, where it was looked for and found.
     """
     from dscp_core import problems
-    from dscp_core.plan import PlanStatus
+    from dscp_core.planning.plan import PlanStatus
 
     settings, plan = planner.settings, _flyable(outcome)
     formulation = settings.formulation or problems.formulations(settings.problem)[0]
@@ -164,8 +164,8 @@ def _check(args: argparse.Namespace) -> None:
 
 def _least_terminal_time(planner: Planner) -> float | None:
     """Least feasible terminal time, by the default formulation: the printed one cannot find it."""
-    from dscp_core.ocp import TERMINAL_TIME
-    from dscp_core.planner import Planner as DefaultPlanner
+    from dscp_core.planning.planner import Planner as DefaultPlanner
+    from dscp_core.problem.declaration import TERMINAL_TIME
 
     settings = replace(planner.settings, formulation=None)
     others = {n: v for n, v in settings.parameters.items() if n != TERMINAL_TIME}
@@ -180,7 +180,7 @@ def _least_terminal_time(planner: Planner) -> float | None:
 
 def _name_least(outcome: PlanOutcome, least_s: float | None) -> PlanOutcome:
     """Says so where the terminal time is too short, however the iterations ended."""
-    from dscp_core.plan import PlanStatus
+    from dscp_core.planning.plan import PlanStatus
 
     used = outcome.terminal_time_used_s
     if least_s is None or used >= least_s:
@@ -193,7 +193,7 @@ def _name_least(outcome: PlanOutcome, least_s: float | None) -> PlanOutcome:
 
 def _flyable(outcome: PlanOutcome) -> Plan | None:
     """The trajectory, if it satisfies the dynamics."""
-    from dscp_core.plan import PlanStatus
+    from dscp_core.planning.plan import PlanStatus
 
     kept = outcome.status in (PlanStatus.CERTIFIED, PlanStatus.NOT_CERTIFIED)
     return outcome.plan if kept else None
@@ -233,7 +233,7 @@ def _write(
     if args.output is not None:
         write_trajectory(args.output, plan, planner.problem, described)
     if args.plot is not None:
-        from dscp_core.plotting import plan_figure
+        from dscp_core.planning.panels import plan_figure
 
         figure = plan_figure(
             plan, outcome.certificate, planner.problem.table.unpack(planner.parameters)

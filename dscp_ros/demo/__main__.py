@@ -184,7 +184,7 @@ def _run_loop(
 def _run(case: DemoCase, folder: Path, paths: Sequence[Path], rate: float, timeout_s: float) -> int:
     say = _teller()
     _isolate(folder)
-    from dscp_core.plotting import plan_figure
+    from dscp_core.planning.panels import plan_figure
     from dscp_ros.demo.recorded import recorded_plan
     from dscp_ros.demo.session import open_input, run_session
     from dscp_ros.demo.summary import figures_of, read_reports, table

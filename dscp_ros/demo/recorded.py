@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from dscp_core import problems
-from dscp_core.plan import Plan
-from dscp_core.verification import PlanCertificate, PlanVerifier
+from dscp_core.planning.certificate import PlanCertificate, PlanVerifier
+from dscp_core.planning.plan import Plan
 from dscp_ros.bag import BagReader
 from dscp_ros.demo.session import TRAJECTORY
 from dscp_ros.demo.summary import Figures

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dscp_core.plan import PlanStatus
+from dscp_core.planning.plan import PlanStatus
 from dscp_ros.bag import BagReader
 from dscp_ros.demo.session import REPORT, InputBag
 from msg_adapters.report import PlanReport

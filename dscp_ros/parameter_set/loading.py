@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from dscp_core.errors import DscpError, InvalidInputError
-from dscp_core.terminal_time import TerminalTimeNetwork, vehicle_of
+from dscp_core.problems.powered_descent.network import TerminalTimeNetwork, vehicle_of
 from dscp_ros.parameter_set.errors import ParameterSetError
 from dscp_ros.parameter_set.format import (
     NETWORK_FILE,

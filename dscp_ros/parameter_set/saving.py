@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from dscp_core.errors import DscpError
-from dscp_core.terminal_time import TerminalTimeNetwork, replace_file
+from dscp_core.files import replace_file
+from dscp_core.problems.powered_descent.network import TerminalTimeNetwork
 from dscp_ros.parameter_set.errors import ParameterSetError
 from dscp_ros.parameter_set.format import (
     FORMAT,

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from dscp_core import problems
-from dscp_core.ocp import OptimalControlProblem
-from dscp_core.planner import PlannerSettings
-from dscp_core.terminal_time import vehicle_of
+from dscp_core.planning.planner import PlannerSettings
+from dscp_core.problem.declaration import OptimalControlProblem
+from dscp_core.problems.powered_descent.network import vehicle_of
 from dscp_ros.planner.declaration import NodeParameter
 from dscp_ros.planner.parameter_files import check_parameter_names, read_file
 from dscp_ros.planner.parameters import (

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 
 from diagnostic_msgs.msg import DiagnosticStatus
 
-from dscp_core.plan import PlanStatus
+from dscp_core.planning.plan import PlanStatus
 from msg_adapters.diagnostics import Health
 from msg_adapters.errors import InputCode
 from msg_adapters.report import NodeCode, PlanReport

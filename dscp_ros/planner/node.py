@@ -25,7 +25,7 @@ from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
 from dscp_core.errors import DscpError
-from dscp_core.planner import Planner
+from dscp_core.planning.planner import Planner
 from dscp_ros.planner.attempts import AttemptRunner, PlanJob, Surroundings
 from dscp_ros.planner.events import ThrottledLog, event_report, refusal_report
 from dscp_ros.planner.health import HealthMonitor

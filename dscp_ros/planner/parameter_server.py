@@ -17,7 +17,7 @@ from rclpy.parameter import Parameter
 
 from dscp_core import problems
 from dscp_core.errors import DscpError, InvalidInputError
-from dscp_core.planner import TerminalTime
+from dscp_core.planning.planner import TerminalTime
 from dscp_ros.planner.declaration import NodeParameter
 from dscp_ros.planner.parameter_files import (
     ParameterArguments,

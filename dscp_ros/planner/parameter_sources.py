@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from dscp_core.terminal_time import vehicle_of
+from dscp_core.problems.powered_descent.network import vehicle_of
 from dscp_ros.parameter_set import ParameterSet, directory_of, load
 from dscp_ros.planner.interfaces import VEHICLE_PREFIX
 from dscp_ros.planner.parameter_files import ParameterArguments, read_file

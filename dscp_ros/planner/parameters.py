@@ -11,13 +11,13 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from dscp_core import problems
+from dscp_core.cone.solvers import SOLVER_NAMES
 from dscp_core.errors import InvalidInputError
-from dscp_core.ocp import OptimalControlProblem
-from dscp_core.planner import PlannerSettings, TerminalTime
-from dscp_core.scp import ScpOptions
-from dscp_core.solvers import SOLVER_NAMES
-from dscp_core.terminal_time import DEFAULT_NETWORK
-from dscp_core.verification import ControlHold
+from dscp_core.planning.certificate import ControlHold
+from dscp_core.planning.planner import PlannerSettings, TerminalTime
+from dscp_core.problem.declaration import OptimalControlProblem
+from dscp_core.problems.powered_descent.network import DEFAULT_NETWORK
+from dscp_core.scp.scp import ScpOptions
 from dscp_ros.planner.declaration import NodeParameter, Value
 from dscp_ros.planner.input_checks import InputSettings
 from dscp_ros.planner.interfaces import VEHICLE_PREFIX, interface_of

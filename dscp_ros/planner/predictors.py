@@ -10,8 +10,8 @@ from typing import Any, NoReturn
 from numpy.typing import NDArray
 
 from dscp_core.errors import InvalidInputError
-from dscp_core.planner import TerminalTimePredictor
-from dscp_core.terminal_time import TerminalTimeNetwork
+from dscp_core.planning.planner import TerminalTimePredictor
+from dscp_core.problems.powered_descent.network import TerminalTimeNetwork
 from dscp_ros.planner.parameters import NETWORK, SHIPPED_NETWORKS
 
 

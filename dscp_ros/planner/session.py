@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from dscp_core.plan import Plan, PlanOutcome, PlanStatus
-from dscp_core.planner import Planner, PlannerSettings, TerminalTimePredictor
+from dscp_core.planning.plan import Plan, PlanOutcome, PlanStatus
+from dscp_core.planning.planner import Planner, PlannerSettings, TerminalTimePredictor
 from msg_adapters.stamps import seconds_from_nanoseconds
 from msg_adapters.state import StampedState
 

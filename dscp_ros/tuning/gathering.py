@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from dscp_core.errors import InvalidInputError
-from dscp_core.planner import TerminalTime
+from dscp_core.planning.planner import TerminalTime
 from dscp_core.tuning.samples import screen
 from dscp_core.tuning.settings import Sample, TuningSettings
 from dscp_ros.tuning.logs import LogContent, LoggedState, read_log
@@ -17,7 +17,7 @@ from dscp_ros.tuning.sources import check_new, file_digests
 from dscp_ros.tuning.split import Split, split_by_share, split_given, thin
 
 if TYPE_CHECKING:
-    from dscp_core.terminal_time import TerminalTimeNetwork
+    from dscp_core.problems.powered_descent.network import TerminalTimeNetwork
     from dscp_ros.tuning.start import Start
 
 OUTSIDE_ENVELOPE = "OUTSIDE_ENVELOPE"

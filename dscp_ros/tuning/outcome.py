@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from dscp_core.parameters import Value
+from dscp_core.problem.parameters import Value
 from dscp_ros.parameter_set.values import CheckedValues
 from dscp_ros.planner.interfaces import VEHICLE_PREFIX
 from dscp_ros.planner.parameters import NETWORK, problem_layout

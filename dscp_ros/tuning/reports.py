@@ -6,7 +6,7 @@ from collections import Counter
 from dataclasses import dataclass, field
 from typing import Any
 
-from dscp_core.plan import PlanStatus
+from dscp_core.planning.plan import PlanStatus
 from msg_adapters.report import PlanReport
 
 UNKNOWN_SET = "unknown"

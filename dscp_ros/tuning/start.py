@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from dscp_core.errors import InvalidInputError
-from dscp_core.planner import TerminalTime
-from dscp_core.terminal_time import TerminalTimeNetwork
+from dscp_core.planning.planner import TerminalTime
+from dscp_core.problems.powered_descent.network import TerminalTimeNetwork
 from dscp_core.tuning.quantities import TunedParameter
 from dscp_ros.parameter_set.values import CheckedValues, check_values
 from dscp_ros.planner.parameter_files import ParameterArguments, check_node_names

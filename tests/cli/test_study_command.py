@@ -13,16 +13,16 @@ import numpy as np
 import pytest
 
 from dscp_core.errors import InvalidInputError
-from dscp_core.losses import FinalStateLoss
-from dscp_core.planner import Planner, PlannerSettings
-from dscp_core.scp import ScpOptions, ScpStatus
+from dscp_core.gradients.differences import RunDifferences
+from dscp_core.gradients.losses import FinalStateLoss
+from dscp_core.planning.planner import Planner, PlannerSettings
+from dscp_core.scp.scp import ScpOptions, ScpStatus
 from dscp_core.studies import (
     surface_to_mass,
     surface_to_mass_figures,
     trust_region,
     trust_region_cases,
 )
-from dscp_core.studies.differences import RunDifferences
 from dscp_core.studies.terminal_time import Sweep, SweepPoint, run_sweep, summarise
 from dscp_core.studies.terminal_time_figure import sweep_figure
 from dscp_core.studies.trust_region_cases import CASES

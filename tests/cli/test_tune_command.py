@@ -17,9 +17,9 @@ from learning_support import network
 from sensor_msgs.msg import JointState
 
 from dscp_core import problems
-from dscp_core.parallel import SerialEngine
-from dscp_core.terminal_time import TerminalTimeNetwork, vehicle_of
+from dscp_core.problems.powered_descent.network import TerminalTimeNetwork, vehicle_of
 from dscp_core.tuning import tuner
+from dscp_core.workers.processes import SerialEngine
 from dscp_ros.bag import BagWriter, Qos
 from dscp_ros.cli import ExitCode
 from dscp_ros.cli import main as frame

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from dscp_core.scp import ScpOptions, StoppingRule
+from dscp_core.scp.scp import ScpOptions, StoppingRule
 
 CASES = {
     "case1": (1.429, 1.536),

@@ -14,9 +14,9 @@ import numpy as np
 import scipy.sparse as sp
 from hypothesis import strategies as st
 
-from dscp_core.cone_program import ConeProgram, ConeSolution, ConeValues, FloatArray, SolveStatus
-from dscp_core.sensitivity import KktSystem, Linearisation
-from dscp_core.solvers import make_solver
+from dscp_core.cone.derivative.sensitivity import KktSystem, Linearisation
+from dscp_core.cone.program import ConeProgram, ConeSolution, ConeValues, FloatArray, SolveStatus
+from dscp_core.cone.solvers import make_solver
 
 
 class ConeState(Enum):

@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from dscp_core.ocp import (
+from dscp_core.problem.declaration import (
     CostTerm,
     InitialGuess,
     OptimalControlProblem,
@@ -19,7 +19,7 @@ from dscp_core.ocp import (
     Variable,
     Where,
 )
-from dscp_core.parameters import Parameter
+from dscp_core.problem.parameters import Parameter
 
 Array = NDArray[np.float64]
 

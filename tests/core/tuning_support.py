@@ -12,9 +12,8 @@ from learning_support import network
 from numpy.typing import NDArray
 
 from dscp_core import problems
-from dscp_core.parallel import SerialEngine
-from dscp_core.planner import PlannerSettings, TerminalTime
-from dscp_core.terminal_time import TerminalTimeNetwork, vehicle_of
+from dscp_core.planning.planner import PlannerSettings, TerminalTime
+from dscp_core.problems.powered_descent.network import TerminalTimeNetwork, vehicle_of
 from dscp_core.tuning.choice import LossChoice
 from dscp_core.tuning.evaluator import TuningModel
 from dscp_core.tuning.network import trainable
@@ -24,6 +23,7 @@ from dscp_core.tuning.samples import StateSet
 from dscp_core.tuning.settings import Sample, TuningSettings
 from dscp_core.tuning.space import SearchSpace
 from dscp_core.tuning.tuner import TuningResult, tune
+from dscp_core.workers.processes import SerialEngine
 
 Array = NDArray[np.float64]
 

@@ -10,10 +10,10 @@ import pytest
 from numpy.typing import NDArray
 
 from dscp_core import problems
-from dscp_core.dscp import Method, tangent, unrolled
-from dscp_core.losses import FinalStateLoss, Loss
-from dscp_core.scp import Scp, ScpOptions
-from dscp_core.transcription import Transcription
+from dscp_core.gradients.losses import FinalStateLoss, Loss
+from dscp_core.gradients.run import Method, tangent, unrolled
+from dscp_core.scp.scp import Scp, ScpOptions
+from dscp_core.transcription.transcription import Transcription
 
 Array = NDArray[np.float64]
 

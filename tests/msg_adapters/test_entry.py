@@ -17,7 +17,7 @@ from trajectory_msgs.msg import JointTrajectory
 from visualization_msgs.msg import Marker, MarkerArray
 
 from dscp_core.errors import InvalidInputError
-from dscp_core.plan import Plan
+from dscp_core.planning.plan import Plan
 from msg_adapters.entry_state import EntryLimits, turned
 from msg_adapters.entry_visualisation import EntryMarkerStyle
 from msg_adapters.errors import InputCode, RejectedInputError

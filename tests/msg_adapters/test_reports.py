@@ -13,8 +13,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rclpy.serialization import deserialize_message, serialize_message
 
-from dscp_core.plan import PlanOutcome, PlanStatus, TerminalTime
-from dscp_core.verification import Check, ControlHold, PlanCertificate
+from dscp_core.planning.certificate import Check, ControlHold, PlanCertificate
+from dscp_core.planning.plan import PlanOutcome, PlanStatus, TerminalTime
 from msg_adapters.diagnostics import Health, health_from_message, message_from_health
 from msg_adapters.errors import InputCode, RejectedInputError
 from msg_adapters.report import (

@@ -10,7 +10,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from dscp_core.ocp import OptimalControlProblem
+from dscp_core.problem.declaration import OptimalControlProblem
 from dscp_core.problems.entry.definition import STATES
 from dscp_core.problems.entry.physics import dynamic_pressure, heat_rate, load_factor
 

@@ -8,8 +8,8 @@ import pytest
 
 from dscp_core import problems
 from dscp_core.problems.entry import physics
-from dscp_core.scp import Scp, ScpOptions, ScpStatus
-from dscp_core.transcription import Transcription
+from dscp_core.scp.scp import Scp, ScpOptions, ScpStatus
+from dscp_core.transcription.transcription import Transcription
 
 from . import entry_nlp, entry_physics
 

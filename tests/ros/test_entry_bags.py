@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 from ros.entry_support import LAYOUT
 
-from dscp_core.plan import PlanStatus
-from dscp_core.planner import Planner
+from dscp_core.planning.plan import PlanStatus
+from dscp_core.planning.planner import Planner
 from dscp_ros.bag import BagReader
 from dscp_ros.planner.input_checks import InputGate, InputSettings
 from msg_adapters.entry_state import EntryLimits

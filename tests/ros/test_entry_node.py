@@ -22,8 +22,8 @@ from sensor_msgs.msg import JointState
 
 from dscp_core import problems
 from dscp_core.errors import InvalidInputError
-from dscp_core.plan import PlanStatus
-from dscp_core.verification import PlanVerifier
+from dscp_core.planning.certificate import PlanVerifier
+from dscp_core.planning.plan import PlanStatus
 from dscp_ros.planner.node import PlannerNode
 from dscp_ros.planner.parameter_files import ParameterArguments
 from dscp_ros.planner.parameters import parameter_table

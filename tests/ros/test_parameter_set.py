@@ -13,7 +13,7 @@ from learning_support import network as random_network
 
 from dscp_core import problems
 from dscp_core.errors import InvalidInputError
-from dscp_core.terminal_time import TerminalTimeNetwork, vehicle_of
+from dscp_core.problems.powered_descent.network import TerminalTimeNetwork, vehicle_of
 from dscp_ros.parameter_set import (
     NETWORK_FILE,
     PARAMETERS_FILE,

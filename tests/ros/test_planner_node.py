@@ -26,7 +26,7 @@ from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory
 from visualization_msgs.msg import Marker
 
-from dscp_core.plan import PlanStatus
+from dscp_core.planning.plan import PlanStatus
 from msg_adapters.diagnostics import health_from_message
 from msg_adapters.errors import InputCode
 from msg_adapters.joint_state import joint_state_from_state

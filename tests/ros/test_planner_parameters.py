@@ -10,7 +10,7 @@ from ros.planner_support import ROOT
 
 from dscp_core import problems
 from dscp_core.errors import InvalidInputError
-from dscp_core.planner import TerminalTime
+from dscp_core.planning.planner import TerminalTime
 from dscp_ros.planner.parameter_files import (
     ParameterArguments,
     check_node_names,

@@ -16,7 +16,7 @@ from ros.planner_support import (
 from rosgraph_msgs.msg import Clock
 
 from dscp_core.errors import InvalidInputError
-from dscp_core.plan import PlanStatus
+from dscp_core.planning.plan import PlanStatus
 from dscp_ros.planner.parameter_files import ParameterArguments
 from msg_adapters.diagnostics import health_from_message
 from msg_adapters.errors import InputCode

@@ -19,8 +19,8 @@ from ros.planner_support import (
 )
 
 from dscp_core.errors import InvalidInputError
-from dscp_core.plan import PlanStatus
-from dscp_core.terminal_time import TerminalTimeNetwork
+from dscp_core.planning.plan import PlanStatus
+from dscp_core.problems.powered_descent.network import TerminalTimeNetwork
 from dscp_ros.parameter_set import ParameterSet, ParameterSetError, save
 from dscp_ros.planner.parameter_files import ParameterArguments
 

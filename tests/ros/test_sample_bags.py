@@ -18,7 +18,7 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 
-from dscp_core.planner import Planner, PlannerSettings, TerminalTime
+from dscp_core.planning.planner import Planner, PlannerSettings, TerminalTime
 from dscp_ros.bag import BagReader
 from dscp_ros.planner.input_checks import InputGate, InputSettings
 from msg_adapters.errors import InputCode, RejectedInputError

@@ -10,8 +10,8 @@ from learning_support import network
 
 from dscp_core import problems
 from dscp_core.errors import DscpError, InvalidInputError
-from dscp_core.planner import TerminalTime
-from dscp_core.terminal_time import TerminalTimeNetwork, vehicle_of
+from dscp_core.planning.planner import TerminalTime
+from dscp_core.problems.powered_descent.network import TerminalTimeNetwork, vehicle_of
 from dscp_core.tuning.quantities import parse_tuned
 from dscp_ros.parameter_set import PARAMETERS_FILE, save
 from dscp_ros.parameter_set.values import check_values

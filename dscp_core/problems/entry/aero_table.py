@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dscp_core.errors import InvalidInputError
-from dscp_core.parameters import Value
+from dscp_core.problem.parameters import Value
 
 Array = NDArray[np.float64]
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dscp_core.errors import InvalidInputError
-from dscp_core.ocp import TRUST_REGION_CONTROL, TRUST_REGION_STATE
+from dscp_core.problem.declaration import TRUST_REGION_CONTROL, TRUST_REGION_STATE
 from dscp_core.problems.entry.physics import ALPHA, BANK, GAMMA, RADIUS, SPEED, coefficients
 
 ALTITUDE_MAX_M = 150e3

@@ -10,7 +10,7 @@ from typing import Any
 
 import casadi as ca
 
-from dscp_core.ocp import (
+from dscp_core.problem.declaration import (
     CostTerm,
     Miss,
     OptimalControlProblem,

@@ -10,8 +10,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dscp_core.errors import InvalidInputError
-from dscp_core.plan import Plan
-from dscp_core.plotting import FLOWN, LIMIT, PLANNED, draw_history, draw_limit, draw_panel_style
+from dscp_core.planning.certificate import PlanCertificate
+from dscp_core.planning.panels import (
+    FLOWN,
+    LIMIT,
+    PLANNED,
+    draw_history,
+    draw_limit,
+    draw_panel_style,
+)
+from dscp_core.planning.plan import Plan
 from dscp_core.problems.entry.physics import (
     ALPHA,
     BANK,
@@ -25,7 +33,6 @@ from dscp_core.problems.entry.physics import (
     heat_rate,
     load_factor,
 )
-from dscp_core.verification import PlanCertificate
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -10,9 +10,9 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from dscp_core.compiled import Symbol
-from dscp_core.ocp import TERMINAL_TIME, InitialGuess
+from dscp_core.problem.declaration import TERMINAL_TIME, InitialGuess
 from dscp_core.problems.entry.physics import ALPHA, LATITUDE, LONGITUDE, SPEED, dynamics
+from dscp_core.transcription.compiled import Symbol
 
 # Steps of the whole flight: 12 s each, where the trajectory swings with periods of minutes. Its
 # error, 1.4 m and 0.02 m/s, matters to nobody; more steps make the guess and its derivative slower.

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 
-from dscp_core.ocp import TERMINAL_TIME
-from dscp_core.parameters import Parameter
+from dscp_core.problem.declaration import TERMINAL_TIME
+from dscp_core.problem.parameters import Parameter
 
 TABLE = "Table 2 of the paper"
 TEXT = "section 4.2.1 of the paper"

@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from dscp_core.ocp import Parameters
+from dscp_core.problem.declaration import Parameters
 
 Value = TypeVar("Value", ca.SX, NDArray[np.float64])
 

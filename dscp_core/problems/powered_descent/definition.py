@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dscp_core.errors import InvalidInputError
-from dscp_core.ocp import (
+from dscp_core.problem.declaration import (
     ConeConstraint,
     CostTerm,
     Miss,

@@ -8,7 +8,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from dscp_core.ocp import TERMINAL_TIME, InitialGuess
+from dscp_core.problem.declaration import TERMINAL_TIME, InitialGuess
 
 
 def norm(vector: ca.SX) -> ca.SX:

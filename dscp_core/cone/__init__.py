@@ -1,0 +1,1 @@
+"""Cone programs: data, residuals, solvers, and the derivative of a solution."""

@@ -1,0 +1,1 @@
+"""Plans: starts and attempts, the certificate, the panels of a figure."""

@@ -1,0 +1,190 @@
+"""One attempt at a plan: SCP runs under a common deadline, each judged by its certificate."""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dscp_core.errors import InvalidInputError
+from dscp_core.planning.certificate import PlanVerifier
+from dscp_core.planning.plan import Plan, PlanOutcome, PlanStatus, TerminalTime
+from dscp_core.problem.declaration import TERMINAL_TIME
+from dscp_core.scp.scp import Iteration, Scp, ScpResult, ScpStatus
+
+Array = NDArray[np.float64]
+
+_STATUS = {
+    ScpStatus.INFEASIBLE: PlanStatus.INFEASIBLE,
+    ScpStatus.SUBPROBLEM_INFEASIBLE: PlanStatus.INFEASIBLE,
+    ScpStatus.ITERATION_LIMIT: PlanStatus.ITERATION_LIMIT,
+    ScpStatus.DEADLINE: PlanStatus.DEADLINE,
+    ScpStatus.SOLVER_FAILURE: PlanStatus.SOLVER_FAILURE,
+    ScpStatus.DIVERGED: PlanStatus.SOLVER_FAILURE,
+}
+
+
+@dataclass(frozen=True)
+class Start:
+    """Where a run starts from.
+
+    Attributes:
+        scp: Loop that runs.
+        parameters: Packed parameters, SI.
+        reference: Scaled reference vector, or None for the problem's initial guess.
+        source: Where the terminal time comes from.
+    """
+
+    scp: Scp
+    parameters: Array
+    reference: Array | None
+    source: TerminalTime
+
+
+class Attempt:
+    """The runs of one call of `dscp_core.planning.planner.Planner.plan`."""
+
+    def __init__(self, verifier: PlanVerifier, started: float, deadline_s: float | None) -> None:
+        """Begin.
+
+        Args:
+            verifier: Certifies the plans.
+            started: When the call came, by ``time.perf_counter``.
+            deadline_s: Wall time from then on for the iterations of all runs, or None.
+        """
+        self._verifier = verifier
+        self._started = started
+        self._deadline_s = deadline_s
+        self._iterations = 0
+        self._solver_time = 0.0
+        self.predicted_s: float | None = None
+        self.reason = ""
+
+    def invalid(self, message: str, terminal_time_s: float, source: TerminalTime) -> PlanOutcome:
+        """Outcome for a state that was refused."""
+        return self._nothing(PlanStatus.INVALID_STATE, message, terminal_time_s, source)
+
+    def with_all_runs(self, outcome: PlanOutcome) -> PlanOutcome:
+        """An earlier run's outcome, with the iterations and times of all of them."""
+        return replace(
+            outcome,
+            iterations=self._iterations,
+            solve_time_s=time.perf_counter() - self._started,
+            solver_time_s=self._solver_time,
+        )
+
+    def run(self, start: Start) -> PlanOutcome:
+        """Iterate, choose an iterate, certify it."""
+        scp = start.scp
+        if self._deadline_s is not None:
+            left = self._deadline_s - (time.perf_counter() - self._started)
+            scp = scp.with_options(deadline_s=max(left, 1e-6))
+        try:
+            result = scp.run(start.parameters, start.reference)
+        except InvalidInputError as error:  # a guess that is not finite
+            time_s = float(start.parameters[scp.transcription.table.slice(TERMINAL_TIME)][0])
+            return self._nothing(
+                PlanStatus.SOLVER_FAILURE, f"no first iteration: {error}", time_s, start.source
+            )
+        self._iterations += len(result.iterations)
+        self._solver_time += sum(i.solve_seconds for i in result.iterations)
+        if result.failed is not None:
+            self._solver_time += result.failed.seconds
+        return self._outcome(start, result, _chosen(scp, result))
+
+    def _nothing(
+        self, status: PlanStatus, message: str, terminal_time_s: float, source: TerminalTime
+    ) -> PlanOutcome:
+        """Outcome without any iterate."""
+        return PlanOutcome(
+            status=status,
+            message=message,
+            plan=None,
+            certificate=None,
+            iterations=self._iterations,
+            solve_time_s=time.perf_counter() - self._started,
+            solver_time_s=self._solver_time,
+            virtual_control=math.inf,
+            max_defect=math.inf,
+            cost=math.inf,
+            terminal_time_predicted_s=self.predicted_s,
+            terminal_time_used_s=terminal_time_s,
+            terminal_time_source=source,
+            terminal_time_reason=self.reason,
+            warm_started=False,
+            solver="",
+        )
+
+    def _outcome(self, start: Start, result: ScpResult, chosen: Iteration | None) -> PlanOutcome:
+        status = _STATUS.get(result.status, PlanStatus.CERTIFIED)
+        message = f"{result.status.value}: {result.message}"
+        plan, certificate = None, None
+        used = start.scp.transcription.terminal_time(result.final_reference, result.parameters)
+        if chosen is not None:
+            plan = self._plan(start.scp, chosen.solution.z, result.parameters)
+            used = plan.terminal_time_s
+            certificate = self._verifier.certify(
+                plan.times_s, plan.states, plan.controls, result.parameters
+            )
+            if status in (PlanStatus.CERTIFIED, PlanStatus.ITERATION_LIMIT, PlanStatus.DEADLINE):
+                if certificate.passed:
+                    status = PlanStatus.CERTIFIED
+                elif status is PlanStatus.CERTIFIED:
+                    status = PlanStatus.NOT_CERTIFIED
+            if not certificate.passed:
+                message += "; certificate: " + "; ".join(certificate.reasons)
+        last = result.failed or (result.iterations[-1].solution if result.iterations else None)
+        return PlanOutcome(
+            status=status,
+            message=message,
+            plan=plan,
+            certificate=certificate,
+            iterations=self._iterations,
+            solve_time_s=time.perf_counter() - self._started,
+            solver_time_s=self._solver_time,
+            virtual_control=_largest(start.scp, chosen, "virtual_control"),
+            max_defect=_largest(start.scp, chosen, "defects"),
+            cost=math.inf if chosen is None else chosen.cost,
+            terminal_time_predicted_s=self.predicted_s,
+            terminal_time_used_s=used,
+            terminal_time_source=start.source,
+            terminal_time_reason=self.reason,
+            warm_started=result.warm_started,
+            solver="" if last is None else last.solver,
+        )
+
+    def _plan(self, scp: Scp, z: Array, parameters: Array) -> Plan:
+        problem, layout = scp.transcription.problem, scp.transcription.layout
+        terminal_time = scp.transcription.terminal_time(z, parameters)
+        states, controls = layout.states(z), layout.controls(z)
+        return Plan(
+            problem=problem.name,
+            state_names=tuple(s.name for s in problem.states),
+            control_names=tuple(c.name for c in problem.controls),
+            control_states=problem.control_states,
+            times_s=np.linspace(0.0, terminal_time, layout.intervals + 1),
+            states=states,
+            controls=controls,
+            state_rates=self._verifier.rates(states, controls, parameters),
+            terminal_time_s=terminal_time,
+        )
+
+
+def _chosen(scp: Scp, result: ScpResult) -> Iteration | None:
+    """The last iterate that satisfies the dynamics, else the last one."""
+    for iteration in reversed(result.iterations):
+        if _relative(scp, iteration.defects) <= 10.0 * scp.defect_tolerance:
+            return iteration
+    return result.iterations[-1] if result.iterations else None
+
+
+def _largest(scp: Scp, chosen: Iteration | None, name: str) -> float:
+    return math.inf if chosen is None else _relative(scp, getattr(chosen, name))
+
+
+def _relative(scp: Scp, residual: Array) -> float:
+    """Largest entry, relative to the states' scales."""
+    return float(np.max(np.abs(residual) / scp.transcription.layout.state_scale))

@@ -1,0 +1,105 @@
+"""Plans, and what became of an attempt to make one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum, IntEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dscp_core.planning.certificate import PlanCertificate
+
+Array = NDArray[np.float64]
+
+
+class PlanStatus(IntEnum):
+    """Outcome of an attempt; the numbers are stable and appear in reports and logs."""
+
+    CERTIFIED = 0
+    NOT_CERTIFIED = 1
+    INFEASIBLE = 2
+    ITERATION_LIMIT = 3
+    DEADLINE = 4
+    SOLVER_FAILURE = 5
+    INVALID_STATE = 6
+
+
+class TerminalTime(Enum):
+    """Where the terminal time comes from.
+
+    FIXED: the parameter ``terminal_time``, and after the first plan what is left of it. FREE: a
+    decision of the subproblems. PREDICTED: a predictor's, where it knows the state, else FREE.
+    """
+
+    FIXED = "fixed"
+    FREE = "free"
+    PREDICTED = "predicted"
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A trajectory in SI; rows are nodes.
+
+    Attributes:
+        problem: Name of the problem.
+        state_names: Names of the nx states.
+        control_names: Names of the nu controls.
+        control_states: Index of the state that each control acts on.
+        times_s: (N+1,) from the initial state.
+        states: (N+1, nx).
+        controls: (N+1, nu).
+        state_rates: (N+1, nx) time derivative of the states under the nodal controls.
+        terminal_time_s: Flight time.
+    """
+
+    problem: str
+    state_names: tuple[str, ...]
+    control_names: tuple[str, ...]
+    control_states: tuple[int, ...]
+    times_s: Array
+    states: Array
+    controls: Array
+    state_rates: Array
+    terminal_time_s: float
+
+
+@dataclass(frozen=True)
+class PlanOutcome:
+    """Everything about one attempt.
+
+    Attributes:
+        status: What became of it.
+        message: In words, with numbers.
+        plan: The trajectory, also of an attempt that was not certified; None without any.
+        certificate: Its check, or None.
+        iterations: SCP iterations, those of a failed warm start included.
+        solve_time_s: Wall time of the whole attempt.
+        solver_time_s: Part of it spent in the cone solver.
+        virtual_control: Largest virtual control, relative to the states' scales.
+        max_defect: Largest defect of the discrete dynamics, relative to the states' scales.
+        cost: Cost of the plan in the problem's units (powered descent: minus the final mass, kg).
+        terminal_time_predicted_s: Prediction of the terminal-time predictor, or None.
+        terminal_time_used_s: Terminal time of the plan, or the one that was tried.
+        terminal_time_source: Where that one comes from.
+        terminal_time_reason: Why from there, where the settings name another source; else empty.
+        warm_started: Whether the result came from the last plan.
+        solver: Backend that answered last.
+    """
+
+    status: PlanStatus
+    message: str
+    plan: Plan | None
+    certificate: PlanCertificate | None
+    iterations: int
+    solve_time_s: float
+    solver_time_s: float
+    virtual_control: float
+    max_defect: float
+    cost: float
+    terminal_time_predicted_s: float | None
+    terminal_time_used_s: float
+    terminal_time_source: TerminalTime
+    terminal_time_reason: str
+    warm_started: bool
+    solver: str

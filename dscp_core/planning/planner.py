@@ -1,0 +1,358 @@
+"""From a state to a certified plan: terminal time, warm start, SCP, certificate."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, Protocol
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from dscp_core import problems
+from dscp_core.errors import InvalidInputError
+from dscp_core.planning.attempt import Attempt, Start
+from dscp_core.planning.certificate import ControlHold, PlanVerifier
+from dscp_core.planning.plan import Plan, PlanOutcome, PlanStatus, TerminalTime
+from dscp_core.problem.declaration import TERMINAL_TIME
+from dscp_core.problem.parameters import Value
+from dscp_core.scp.scp import Scp, ScpOptions, ScpStatus
+from dscp_core.transcription.transcription import Transcription
+
+__all__ = ["Planner", "PlannerSettings", "TerminalTime", "TerminalTimePredictor"]
+
+Array = NDArray[np.float64]
+
+# Of a plan's flight time; with less than this left, its grid is too coarse to start from.
+_LEAST_REMAINING = 0.05
+
+# Greatest distance of a state from a plan to start from that, in units of the states' scales.
+# Farther away, iterations take longer than from none, with a predicted terminal time sooner: in a
+# box about the paper's case, 6.2 against 6.2 at 0.05 and 6.5 against 5.0 at 0.1; with a free one,
+# 4.9 against 5.2 at 0.1 and 5.7 against 5.5 at 0.2. A fixed one stays that of the plan anyway.
+_NEAR = {TerminalTime.PREDICTED: 0.05, TerminalTime.FREE: 0.2, TerminalTime.FIXED: math.inf}
+
+
+class TerminalTimePredictor(Protocol):
+    """Predicts the optimal terminal time of a state."""
+
+    def predict(self, state: Array) -> float:
+        """Terminal time in seconds for a state (nx,), SI.
+
+        Raises:
+            InvalidInputError: It does not know this state.
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class PlannerSettings:
+    """What to plan and how; the defaults are those of powered descent, see `suited`.
+
+    Attributes:
+        problem: Name of the problem.
+        formulation: Its formulation, or None for the default.
+        parameters: Vehicle, mission and algorithm parameters that differ from the defaults, SI.
+        intervals: Number N of intervals.
+        terminal_time: Where the terminal time comes from.
+        hold: How the certificate flies the controls between the nodes.
+        options: How to iterate; its deadline is set for every plan.
+    """
+
+    problem: str = "powered_descent"
+    formulation: str | None = None
+    parameters: Mapping[str, Value] = field(default_factory=dict)
+    intervals: int = 50
+    terminal_time: TerminalTime = TerminalTime.FIXED
+    hold: ControlHold = ControlHold.MEAN
+    options: ScpOptions = field(default_factory=ScpOptions)
+
+    @staticmethod
+    def suited(problem: str, formulation: str | None = None, **changes: Any) -> PlannerSettings:
+        """Settings with the number of intervals and the terminal time that suit a problem.
+
+        Args:
+            problem: Name of the problem.
+            formulation: Its formulation, or None for the default.
+            **changes: Other attributes.
+
+        Raises:
+            InvalidInputError: Unknown problem or formulation.
+        """
+        declared = problems.get(problem, formulation)
+        own: dict[str, Any] = {
+            "intervals": declared.default_intervals,
+            "terminal_time": TerminalTime.FREE
+            if declared.free_terminal_time
+            else TerminalTime.FIXED,
+        }
+        return PlannerSettings(problem, formulation, **{**own, **changes})
+
+
+@dataclass(frozen=True)
+class _Remainder:
+    """What is left of a plan: from ``elapsed_s`` on, for ``seconds``.
+
+    Attributes:
+        plan: The plan.
+        elapsed_s: From its start.
+        seconds: To its end.
+        distance: Of the state to plan from, in units of the states' scales.
+    """
+
+    plan: Plan
+    elapsed_s: float
+    seconds: float
+    distance: float
+
+    def helps(self, source: TerminalTime) -> bool:
+        """Whether it is a start, with a terminal time from this source."""
+        return self.distance <= _NEAR[source]
+
+
+_FINAL = (PlanStatus.CERTIFIED, PlanStatus.DEADLINE)
+"""After these there is no reason, or no time, for another start."""
+
+
+class Planner:
+    """Makes plans for one problem; keeps all symbolic work between plans.
+
+    Not safe for plans from several threads at once.
+    """
+
+    def __init__(
+        self, settings: PlannerSettings, predictor: TerminalTimePredictor | None = None
+    ) -> None:
+        """Compile the problem.
+
+        Args:
+            settings: What to plan and how.
+            predictor: Needed for, and only for, `TerminalTime.PREDICTED`.
+
+        Raises:
+            InvalidInputError: Unknown problem, parameter or value, or a missing predictor.
+        """
+        if (settings.terminal_time is TerminalTime.PREDICTED) != (predictor is not None):
+            raise InvalidInputError(
+                "predictor",
+                type(predictor).__name__,
+                f"given exactly when terminal_time ({settings.terminal_time.value}) is predicted",
+            )
+        self.settings = settings
+        self._predictor = predictor
+        self.problem = problems.get(settings.problem, settings.formulation)
+        self.parameters = self.problem.pack(settings.parameters)
+        self.scp = self._loop(free=settings.terminal_time is TerminalTime.FREE)
+        self.transcription = self.scp.transcription
+        # Where the predictor does not help; compiled now, as no deadline has time for it.
+        self._free = self.scp if predictor is None else self._loop(free=True)
+        self._verifier = PlanVerifier(self.problem, settings.intervals, hold=settings.hold)
+        self._time = self.problem.table.slice(TERMINAL_TIME)
+        self._time_bounds = self._bounds_of_time()
+        self._state_slices = [
+            self.problem.table.slice(name) for name in self.problem.initial_state_parameters
+        ]
+
+    def _loop(self, *, free: bool) -> Scp:
+        transcription = Transcription(
+            self.problem, self.settings.intervals, free_terminal_time=free
+        )
+        return Scp(transcription, self.settings.options)
+
+    def _bounds_of_time(self) -> tuple[float, float]:
+        """Least and greatest terminal time where it is free, in seconds."""
+        if self.problem.terminal_time_bounds is None:
+            return 0.0, math.inf
+        values = {n: ca.SX(v) for n, v in self.problem.table.unpack(self.parameters).items()}
+        low, high = self.problem.terminal_time_bounds(values)
+        return float(low), float(high)
+
+    @property
+    def state_names(self) -> tuple[str, ...]:
+        """Names of the states, in the order of every state vector."""
+        return tuple(s.name for s in self.problem.states)
+
+    @property
+    def initial_state(self) -> Array:
+        """Initial state of the settings' parameters, (nx,), SI."""
+        return np.concatenate([self.parameters[part] for part in self._state_slices])
+
+    def check_state(self, state: Array) -> Array:
+        """Packed parameters with this initial state.
+
+        Args:
+            state: (nx,), SI, in the order of `state_names`.
+
+        Raises:
+            InvalidInputError: Wrong length, not finite, out of bounds, or below ground.
+        """
+        state = np.asarray(state, dtype=np.float64)
+        if state.shape != (len(self.problem.states),):
+            raise InvalidInputError(
+                "state", f"shape {state.shape}", f"shape ({len(self.problem.states)},)"
+            )
+        for name, value in zip(self.state_names, state, strict=True):
+            if not math.isfinite(value):
+                raise InvalidInputError(name, float(value), "finite")
+        table = self.problem.table
+        packed = table.pack(self.problem.initial_state_values(state), base=self.parameters)
+        if self.problem.check_state is not None:
+            self.problem.check_state(state, table.unpack(packed))
+        return packed
+
+    def plan(
+        self,
+        state: Array,
+        *,
+        deadline_s: float | None = None,
+        warm_start: Plan | None = None,
+        elapsed_s: float = 0.0,
+    ) -> PlanOutcome:
+        """Plan from a state.
+
+        A warm start that does not lead to a certified plan is followed by a cold one, and with a
+        free terminal time by another from the problem's own guess of it, as far as the deadline
+        allows. So is a prediction: all that follows it, and all for a state that the predictor
+        does not know, has a free terminal time.
+
+        Args:
+            state: (nx,), SI, in the order of `state_names`.
+            deadline_s: Wall time for the SCP iterations, or None.
+            warm_start: A plan of the same vehicle to start from, if the state is near it.
+            elapsed_s: Flight time between that plan's start and this state.
+        """
+        attempt = Attempt(self._verifier, time.perf_counter(), deadline_s)
+        source = self.settings.terminal_time
+        try:
+            packed = self.check_state(state)
+        except InvalidInputError as error:
+            return attempt.invalid(str(error), self._terminal_time(self.parameters), source)
+        left = self._left(warm_start, elapsed_s, state)
+        if self._predictor is not None:
+            try:
+                attempt.predicted_s = self._predict(self._predictor, state)
+            except InvalidInputError as error:
+                attempt.reason = str(error)
+            else:
+                outcome = attempt.run(self._predicted(state, packed, attempt.predicted_s, left))
+                if outcome.status in _FINAL:
+                    return outcome
+                attempt.reason = (
+                    f"no plan in the predicted {attempt.predicted_s:.3f} s: {outcome.message}"
+                )
+            source = TerminalTime.FREE
+        return self._first_certified(attempt, self._starts(state, packed, left, source))
+
+    def _first_certified(self, attempt: Attempt, starts: Iterator[Start]) -> PlanOutcome:
+        """Outcome of the first start that leads to a certified plan.
+
+        Without any, that of the last, unless an earlier one converged and says more.
+        """
+        uncertified: PlanOutcome | None = None
+        for start in starts:
+            outcome = attempt.run(start)
+            if outcome.status is PlanStatus.CERTIFIED:
+                return outcome
+            if outcome.status is PlanStatus.NOT_CERTIFIED:
+                uncertified = outcome
+            if outcome.status is PlanStatus.DEADLINE:
+                break
+        return outcome if uncertified is None else attempt.with_all_runs(uncertified)
+
+    def _left(self, plan: Plan | None, elapsed_s: float, state: Array) -> _Remainder | None:
+        """What is left of a plan, where that is enough to start from."""
+        if plan is None or plan.problem != self.problem.name or not elapsed_s >= 0.0:
+            return None
+        seconds = plan.terminal_time_s - elapsed_s
+        if seconds <= _LEAST_REMAINING * plan.terminal_time_s:
+            return None
+        planned = np.array([np.interp(elapsed_s, plan.times_s, x) for x in plan.states.T])
+        scale = self.transcription.layout.state_scale
+        return _Remainder(plan, elapsed_s, seconds, float(np.max(np.abs(state - planned) / scale)))
+
+    def _predict(self, predictor: TerminalTimePredictor, state: Array) -> float:
+        """Prediction within the bounds of a free terminal time.
+
+        Raises:
+            InvalidInputError: The predictor does not know the state, or is out of bounds.
+        """
+        declared = self.problem.table[TERMINAL_TIME]
+        seconds = float(declared.validate(predictor.predict(state))[0])
+        low, high = self._time_bounds
+        if not low <= seconds <= high:
+            raise InvalidInputError("predicted terminal time", seconds, f"{low:g} to {high:g} s")
+        return seconds
+
+    def _predicted(
+        self, state: Array, packed: Array, predicted_s: float, left: _Remainder | None
+    ) -> Start:
+        """Start with the predicted terminal time: from a plan that is near, else cold."""
+        packed = self._with_time(packed, predicted_s)
+        reference = None
+        if left is not None and left.helps(TerminalTime.PREDICTED):
+            reference = self._resample(left, state, self.scp, predicted_s)
+        return Start(self.scp, packed, reference, TerminalTime.PREDICTED)
+
+    def _starts(
+        self, state: Array, packed: Array, left: _Remainder | None, source: TerminalTime
+    ) -> Iterator[Start]:
+        """What to start from with a fixed or free terminal time, the most promising first."""
+        free = source is TerminalTime.FREE
+        scp = self._free if free else self.scp
+        if left is not None and left.helps(source):
+            packed = self._with_time(packed, left.seconds)
+            reference = self._resample(left, state, scp, left.seconds)
+            yield Start(scp, packed, reference, source)
+        yield Start(scp, packed, None, source)
+        guess = self.problem.terminal_time_guess
+        if free and guess is not None:
+            seconds = guess(state, self.problem.table.unpack(packed))
+            yield Start(scp, self._with_time(packed, seconds), None, source)
+
+    def least_terminal_time(self, state: Array) -> float | None:
+        """Least feasible terminal time of a state in seconds, or None when none was found.
+
+        Raises:
+            InvalidInputError: Invalid state.
+        """
+        if not self.problem.least_time_parameters:
+            return None
+        settings = replace(
+            self.settings,
+            terminal_time=TerminalTime.FREE,
+            parameters={**self.settings.parameters, **self.problem.least_time_parameters},
+            # The fastest descent converges slowly; 1e-4 s is enough.
+            options=replace(
+                self.settings.options,
+                max_iterations=50,
+                fixed_iterations=None,
+                cost_tolerance=3e-6,
+            ),
+        )
+        fastest = Planner(settings)
+        result = fastest.scp.run(fastest.check_state(state))
+        if result.status is not ScpStatus.CONVERGED:
+            return None
+        return fastest.transcription.terminal_time(result.final_reference, result.parameters)
+
+    def _terminal_time(self, packed: Array) -> float:
+        return float(packed[self._time][0])
+
+    def _with_time(self, packed: Array, seconds: float) -> Array:
+        changed = packed.copy()
+        changed[self._time] = seconds
+        return changed
+
+    def _resample(self, left: _Remainder, state: Array, scp: Scp, seconds: float) -> Array:
+        """Reference vector from what is left of a plan, stretched to a terminal time."""
+        plan = left.plan
+        moments = np.linspace(left.elapsed_s, plan.terminal_time_s, self.settings.intervals + 1)
+        states, controls = (
+            np.column_stack([np.interp(moments, plan.times_s, column) for column in table.T])
+            for table in (plan.states, plan.controls)
+        )
+        states[0] = state
+        return scp.transcription.layout.reference(states, controls, seconds)

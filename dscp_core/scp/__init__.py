@@ -1,0 +1,1 @@
+"""Sequential convex programming: the forward pass, its trace, its stopping rules."""

@@ -1,0 +1,391 @@
+"""Sequential convex programming: the forward pass (section 3.2.1)."""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import dataclass, field, replace
+from enum import Enum
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dscp_core.cone.derivative.sensitivity import KktSystem
+from dscp_core.cone.program import ConePattern, ConeSolution, ConeValues, SolveStatus
+from dscp_core.cone.solvers import SolverSettings, make_solver
+from dscp_core.errors import InvalidInputError
+from dscp_core.scp.trace import Iteration, ScpResult, ScpStatus
+from dscp_core.transcription.transcription import Evaluation, Transcription
+
+__all__ = [
+    "Iteration",
+    "Scp",
+    "ScpOptions",
+    "ScpResult",
+    "ScpStatus",
+    "StoppingRule",
+    "objective",
+]
+
+Array = NDArray[np.float64]
+
+DEFAULT_SOLVER = "clarabel"
+GRADIENT_TOLERANCE = 1e-12
+"""Interior-point tolerance at which weakly active constraints are told from inactive ones."""
+
+
+_SETTLED_ITERATIONS = 3
+_SETTLED_CHANGE = 1e-3
+_SETTLED_DEFECT = 0.05  # of the virtual control
+
+
+class StoppingRule(Enum):
+    """When the iterations have converged.
+
+    GUARDED: the change of the cost, the change that the subproblem predicted, and the defects are
+    all small. COST_CHANGE: the paper's rule for reproduction, the change of the true cost alone,
+    which may be small for one iteration on the way, at a trajectory that cannot be flown.
+    """
+
+    GUARDED = "guarded"
+    COST_CHANGE = "cost_change"
+
+
+@dataclass(frozen=True)
+class ScpOptions:
+    """How to iterate.
+
+    Attributes:
+        max_iterations: Iteration limit.
+        fixed_iterations: Run exactly this many iterations without testing, or None.
+        stopping: Which tests end the iterations.
+        cost_tolerance: Bound on the relative change of the penalised cost (eq. for epsilon_J) and
+            on the change that the subproblem predicted, or None for the problem's own.
+        defect_tolerance: Bound on the defects, relative to the states' scales, or None for the
+            problem's own.
+        virtual_control_tolerance: Bound on the virtual control, relative to the states' scales, or
+            None for the problem's own.
+        polish: Refine each subproblem's solution on its active set, for differentiation.
+        deadline_s: Wall time for all iterations, or None.
+        solver: Backend, or backends to try in order, separated by commas.
+        solver_settings: Accuracy and limits of the backend.
+    """
+
+    max_iterations: int = 20
+    fixed_iterations: int | None = None
+    stopping: StoppingRule = StoppingRule.GUARDED
+    cost_tolerance: float | None = None
+    defect_tolerance: float | None = None
+    virtual_control_tolerance: float | None = None
+    polish: bool = False
+    deadline_s: float | None = None
+    solver: str = DEFAULT_SOLVER
+    solver_settings: SolverSettings = field(default_factory=SolverSettings)
+
+    def __post_init__(self) -> None:
+        for name in ("cost_tolerance", "defect_tolerance", "virtual_control_tolerance"):
+            value = getattr(self, name)
+            if value is not None and not value > 0.0:
+                raise InvalidInputError(name, value, "> 0")
+        if self.max_iterations < 1:
+            raise InvalidInputError("max_iterations", self.max_iterations, ">= 1")
+        if self.fixed_iterations is not None and self.fixed_iterations < 1:
+            raise InvalidInputError("fixed_iterations", self.fixed_iterations, ">= 1")
+        if self.deadline_s is not None and not self.deadline_s > 0.0:
+            raise InvalidInputError("deadline_s", self.deadline_s, "> 0")
+
+    @staticmethod
+    def for_gradients(**changes: Any) -> ScpOptions:
+        """Options for runs that will be differentiated: polished, tightly solved subproblems."""
+        settings = SolverSettings(tolerance=GRADIENT_TOLERANCE)
+        return replace(ScpOptions(polish=True, solver_settings=settings), **changes)
+
+    @property
+    def iteration_limit(self) -> int:
+        """Most iterations that a run does."""
+        return self.fixed_iterations or self.max_iterations
+
+
+class Scp:
+    """The SCP loop of one transcription; keeps solver and symbolic work between runs.
+
+    Not safe for runs from several threads at once.
+    """
+
+    def __init__(self, transcription: Transcription, options: ScpOptions | None = None) -> None:
+        self.transcription = transcription
+        self.options = options or ScpOptions()
+        self.kkt = KktSystem(transcription.pattern)
+        self._solver = make_solver(
+            self.options.solver, transcription.pattern, self.options.solver_settings
+        )
+
+    @property
+    def cost_tolerance(self) -> float:
+        """Bound on the relative change of the cost: of the options, or else of the problem."""
+        given = self.options.cost_tolerance
+        return self.transcription.problem.cost_tolerance if given is None else given
+
+    @property
+    def defect_tolerance(self) -> float:
+        """Bound on the defects: of the options, or else of the problem."""
+        given = self.options.defect_tolerance
+        return self.transcription.problem.defect_tolerance if given is None else given
+
+    @property
+    def virtual_control_tolerance(self) -> float:
+        """Bound on the virtual control: of the options, or else of the problem."""
+        given = self.options.virtual_control_tolerance
+        return self.transcription.problem.virtual_control_tolerance if given is None else given
+
+    def with_options(self, **changes: Any) -> Scp:
+        """A loop with changed options that shares this one's symbolic work."""
+        options = replace(self.options, **changes)
+        copy = object.__new__(Scp)
+        copy.transcription, copy.options, copy.kkt = self.transcription, options, self.kkt
+        same = (options.solver, options.solver_settings) == (
+            self.options.solver,
+            self.options.solver_settings,
+        )
+        copy._solver = (
+            self._solver
+            if same
+            else make_solver(options.solver, self.transcription.pattern, options.solver_settings)
+        )
+        return copy
+
+    def run(self, parameters: Array, initial_reference: Array | None = None) -> ScpResult:
+        """Iterate to convergence, or for a fixed number of iterations.
+
+        Args:
+            parameters: Packed parameters, SI.
+            initial_reference: Scaled reference vector to start from; None for the problem's
+                initial guess.
+        """
+        return _Run(self, parameters, initial_reference).execute()
+
+    def solve(self, values: ConeValues, time_limit_s: float | None) -> ConeSolution:
+        """Solve one subproblem."""
+        return self._solver.solve(values, time_limit_s=time_limit_s)
+
+
+class _Run:
+    """State of one run."""
+
+    def __init__(self, scp: Scp, parameters: Array, initial_reference: Array | None) -> None:
+        self._start = time.perf_counter()
+        self._scp = scp
+        self._options = scp.options
+        self._virtual_tolerance = scp.virtual_control_tolerance
+        self._transcription = scp.transcription
+        self._parameters = np.array(parameters, dtype=np.float64)
+        self._warm = initial_reference is not None
+        self._initial = (
+            self._transcription.initial_guess(self._parameters)
+            if initial_reference is None
+            else np.array(initial_reference, dtype=np.float64)
+        )
+        expected = self._transcription.layout.reference_size
+        if self._initial.shape != (expected,):
+            raise InvalidInputError(
+                "initial_reference", f"shape {self._initial.shape}", f"shape ({expected},)"
+            )
+        if not np.all(np.isfinite(self._initial)):
+            what = "initial_reference" if self._warm else "the problem's initial guess"
+            raise InvalidInputError(what, "NaN or Inf", "finite")
+        self._iterations: list[Iteration] = []
+        self._first_cost = math.nan
+
+    def execute(self) -> ScpResult:
+        reference = self._initial
+        evaluation = self._transcription.evaluate(reference, self._parameters)
+        self._first_cost = evaluation.cost
+        for _ in range(self._options.iteration_limit):
+            remaining = self._remaining()
+            if remaining is not None and remaining <= 0.0:
+                return self._finish(ScpStatus.DEADLINE, "no time for another iteration")
+            try:
+                iteration, evaluation = self._iterate(reference, evaluation, remaining)
+            except InvalidInputError as error:  # the solvers refuse data that are not finite
+                return self._finish(ScpStatus.DIVERGED, f"{self._progress()}; {error}")
+            if isinstance(iteration, ConeSolution):
+                return self._failure(iteration, reference)
+            self._iterations.append(iteration)
+            reference = iteration.solution.z[: reference.size]
+            if self._options.fixed_iterations is None:
+                if self._stationary():
+                    return self._converged()
+                if self._virtual_control_settled():
+                    return self._finish(ScpStatus.INFEASIBLE, self._progress())
+        if self._options.fixed_iterations is not None:
+            return self._finish(ScpStatus.FIXED_ITERATIONS, f"{len(self._iterations)} done")
+        return self._finish(ScpStatus.ITERATION_LIMIT, self._progress())
+
+    def _remaining(self) -> float | None:
+        if self._options.deadline_s is None:
+            return None
+        return self._options.deadline_s - (time.perf_counter() - self._start)
+
+    def _iterate(
+        self, reference: Array, before: Evaluation, time_limit_s: float | None
+    ) -> tuple[Iteration | ConeSolution, Evaluation]:
+        transcription, layout = self._transcription, self._transcription.layout
+        started = time.perf_counter()
+        values = transcription.values(reference, self._parameters)
+        assembled = time.perf_counter()
+        solution = self._scp.solve(values, time_limit_s)
+        solved = time.perf_counter()
+        if solution.status is not SolveStatus.SOLVED:
+            return solution, before
+        linearisation = None
+        if self._options.polish:
+            linearisation = self._scp.kkt.linearise(values, solution)
+            solution = linearisation.solution
+        polished = time.perf_counter()
+        evaluation = transcription.evaluate(solution.z[: reference.size], self._parameters)
+        iteration = Iteration(
+            reference=reference,
+            values=values,
+            solution=solution,
+            linearisation=linearisation,
+            cost=evaluation.cost,
+            penalised_cost=evaluation.cost / transcription.problem.cost_scale
+            + _virtual_penalty(layout.reference_size, transcription.pattern, values, solution.z),
+            predicted_change=self._predicted_change(values, reference, before, solution.z),
+            defects=evaluation.defects,
+            virtual_control=layout.virtual_control(solution.z),
+            assembly_seconds=assembled - started + time.perf_counter() - polished,
+            solve_seconds=solved - assembled,
+            polish_seconds=polished - solved,
+        )
+        return iteration, evaluation
+
+    def _predicted_change(
+        self, values: ConeValues, reference: Array, before: Evaluation, z: Array
+    ) -> float:
+        layout, pattern = self._transcription.layout, self._transcription.pattern
+        start = np.concatenate([reference, layout.virtual_part(before.defects)])
+        return objective(pattern, values, z) - objective(pattern, values, start)
+
+    def _stationary(self) -> bool:
+        """Whether the last iteration changed nothing that matters, feasible or not."""
+        if self._options.stopping is StoppingRule.COST_CHANGE:
+            return self._cost_stands_still()
+        last, tolerance = self._iterations[-1], self._scp.cost_tolerance
+        if len(self._iterations) < 2 and not self._warm:
+            return False
+        problem = self._transcription.problem
+        least = (problem.cost_magnitude or problem.cost_scale) / problem.cost_scale
+        scale = max(least, abs(last.penalised_cost))
+        if abs(last.predicted_change) > tolerance * scale:
+            return False
+        if len(self._iterations) > 1:
+            change = last.penalised_cost - self._iterations[-2].penalised_cost
+            if abs(change) > tolerance * scale:
+                return False
+        residual = self._relative(last.defects - last.virtual_control)
+        return residual <= self._scp.defect_tolerance
+
+    def _cost_stands_still(self) -> bool:
+        """The paper's rule: relative change of the true cost from reference to solution."""
+        iterations = self._iterations
+        before = iterations[-2].cost if len(iterations) > 1 else self._first_cost
+        return abs(iterations[-1].cost - before) < self._scp.cost_tolerance * abs(before)
+
+    def _virtual_control_settled(self) -> bool:
+        """Whether the virtual control has stopped at a size that is no rounding.
+
+        Where no trajectory is feasible, the penalty dwarfs the cost and the solver's noise in it
+        hides convergence from the tests of the cost.
+        """
+        last = self._iterations[-1]
+        sizes = [self._relative(i.virtual_control) for i in self._iterations[-_SETTLED_ITERATIONS:]]
+        return (
+            len(sizes) == _SETTLED_ITERATIONS
+            and self._relative(last.defects - last.virtual_control) <= _SETTLED_DEFECT * min(sizes)
+            and min(sizes) > self._virtual_tolerance
+            and max(sizes) - min(sizes) <= _SETTLED_CHANGE * max(sizes)
+        )
+
+    def _relative(self, residual: Array) -> float:
+        return float(np.max(np.abs(residual) / self._transcription.layout.state_scale))
+
+    def _converged(self) -> ScpResult:
+        last = self._iterations[-1]
+        virtual = self._relative(last.virtual_control)
+        if virtual > self._virtual_tolerance:
+            return self._finish(ScpStatus.INFEASIBLE, self._progress())
+        return self._finish(ScpStatus.CONVERGED, self._progress())
+
+    def _progress(self) -> str:
+        if not self._iterations:
+            return "no iteration done"
+        last = self._iterations[-1]
+        return (
+            f"{len(self._iterations)} iterations, predicted change {last.predicted_change:.1e}, "
+            f"defect {self._relative(last.defects):.1e}, "
+            f"virtual control {self._relative(last.virtual_control):.1e} (scaled)"
+        )
+
+    def _failure(self, solution: ConeSolution, reference: Array) -> ScpResult:
+        number = len(self._iterations) + 1
+        message = f"iteration {number}: {solution.solver}: {solution.status.value}"
+        if solution.message:
+            message += f" ({solution.message})"
+        if solution.status is SolveStatus.TIME_LIMIT:
+            return self._finish(ScpStatus.DEADLINE, message, solution)
+        if solution.status is SolveStatus.INFEASIBLE:
+            return self._finish(ScpStatus.SUBPROBLEM_INFEASIBLE, message, solution)
+        status, reason = self._diagnose(reference)
+        return self._finish(status, f"{message}; {reason}", solution)
+
+    def _diagnose(self, reference: Array) -> tuple[ScpStatus, str]:
+        """Tell an infeasible subproblem from a failing solver, by its least virtual control.
+
+        Where even that is large, the penalty's multipliers are what the solver failed on.
+        """
+        layout, pattern = self._transcription.layout, self._transcription.pattern
+        values = self._transcription.values(reference, self._parameters).copy()
+        virtual = int(pattern.q.indptr[layout.reference_size])
+        values.q[:virtual] = 0.0
+        values.q[virtual:] = 1.0
+        values.c[:] = 0.0
+        least = self._scp.solve(values, self._remaining())
+        if least.status is SolveStatus.INFEASIBLE:
+            if layout.virtual_states.size:
+                return ScpStatus.SUBPROBLEM_INFEASIBLE, "infeasible even with free virtual control"
+            return ScpStatus.SUBPROBLEM_INFEASIBLE, "infeasible whatever the cost"
+        if least.status is SolveStatus.SOLVED:
+            size = self._relative(layout.virtual_control(least.z))
+            if size > self._virtual_tolerance:
+                found = f"the subproblem needs a virtual control of {size:.1e} (scaled)"
+                return ScpStatus.INFEASIBLE, found
+        return ScpStatus.SOLVER_FAILURE, "not infeasible as far as can be told"
+
+    def _finish(
+        self, status: ScpStatus, message: str, failed: ConeSolution | None = None
+    ) -> ScpResult:
+        return ScpResult(
+            status=status,
+            message=message,
+            iterations=tuple(self._iterations),
+            parameters=self._parameters,
+            initial_reference=self._initial,
+            warm_started=self._warm,
+            seconds=time.perf_counter() - self._start,
+            failed=failed,
+        )
+
+
+def objective(pattern: ConePattern, values: ConeValues, z: Array) -> float:
+    """Objective 1/2 z'Qz + c'z of a subproblem."""
+    rows, columns = pattern.q.indices, pattern.q.columns
+    weight = np.where(rows == columns, 0.5, 1.0)
+    return float(np.dot(weight * values.q, z[rows] * z[columns]) + np.dot(values.c, z))
+
+
+def _virtual_penalty(start: int, pattern: ConePattern, values: ConeValues, z: Array) -> float:
+    """Penalty of the virtual control, whose part of Q is diagonal and comes last."""
+    first = int(pattern.q.indptr[start])
+    return float(0.5 * np.dot(values.q[first:], z[start:] ** 2)) if first < values.q.size else 0.0

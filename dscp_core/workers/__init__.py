@@ -1,0 +1,1 @@
+"""Evaluating many independent items: here, in processes, or on a Ray cluster."""

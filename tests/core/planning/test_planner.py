@@ -1,0 +1,331 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from oracles.powered_descent_nlp import Status, solve_free_time, solve_least_time
+from oracles.powered_descent_physics import PAPER_INITIAL_STATE, PAPER_PARAMETERS, state_rate
+
+from dscp_core.cone.solvers import SolverSettings
+from dscp_core.errors import InvalidInputError
+from dscp_core.planning.certificate import ControlHold
+from dscp_core.planning.plan import Plan, PlanOutcome, PlanStatus
+from dscp_core.planning.planner import Planner, PlannerSettings, TerminalTime
+from dscp_core.scp.scp import ScpOptions
+
+Array = NDArray[np.float64]
+
+START = np.array(PAPER_INITIAL_STATE)
+
+
+@pytest.fixture(scope="module")
+def fixed() -> Planner:
+    return Planner(PlannerSettings())
+
+
+@pytest.fixture(scope="module")
+def free() -> Planner:
+    return Planner(PlannerSettings(terminal_time=TerminalTime.FREE))
+
+
+@pytest.fixture(scope="module")
+def first(fixed: Planner) -> Plan:
+    return plan_of(fixed.plan(START))
+
+
+def plan_of(outcome: PlanOutcome) -> Plan:
+    assert outcome.plan is not None, outcome.message
+    return outcome.plan
+
+
+def test_nominal_plan_is_certified(fixed: Planner) -> None:
+    outcome = fixed.plan(START)
+    assert outcome.status is PlanStatus.CERTIFIED
+    assert outcome.certificate is not None
+    assert outcome.certificate.passed
+    assert 2 <= outcome.iterations <= 10
+    assert not outcome.warm_started
+    assert outcome.terminal_time_used_s == 32.81
+    assert outcome.terminal_time_predicted_s is None
+    assert outcome.solver in ("clarabel", "qoco", "ecos")
+    # IPOPT finds 31760.299756 kg; relative 1e-6 of it.
+    assert outcome.cost == pytest.approx(-31760.299756, rel=1e-6)
+    assert outcome.virtual_control < 1e-6
+    assert outcome.max_defect < 1e-6
+    assert 0.0 < outcome.solver_time_s < outcome.solve_time_s
+
+
+def test_plan_is_in_si_and_complete(fixed: Planner, first: Plan) -> None:
+    assert first.problem == "powered_descent"
+    assert first.state_names == fixed.state_names == ("x", "y", "z", "vx", "vy", "vz", "mass")
+    assert first.control_names == ("thrust_x", "thrust_y", "thrust_z")
+    assert first.control_states == (3, 4, 5)
+    assert first.terminal_time_s == 32.81
+    np.testing.assert_allclose(first.times_s, np.linspace(0.0, 32.81, 51), rtol=1e-14)
+    assert first.states.shape == (51, 7)
+    assert first.controls.shape == (51, 3)
+    np.testing.assert_allclose(first.states[0], START, rtol=1e-9)
+    np.testing.assert_allclose(first.states[-1, :6], np.zeros(6), atol=1e-5)
+    rates = [
+        state_rate(x, u, PAPER_PARAMETERS)
+        for x, u in zip(first.states, first.controls, strict=True)
+    ]
+    np.testing.assert_allclose(first.state_rates, rates, rtol=1e-12)
+
+
+def test_initial_state_of_the_settings(fixed: Planner) -> None:
+    np.testing.assert_array_equal(fixed.initial_state, START)
+    other = Planner(PlannerSettings(parameters={"initial_mass": 36000.0}, intervals=5))
+    assert other.initial_state[6] == 36000.0
+
+
+def test_free_terminal_time(free: Planner) -> None:
+    outcome = free.plan(START)
+    oracle = solve_free_time(PAPER_INITIAL_STATE)
+    assert oracle.status is Status.OPTIMAL
+    assert outcome.status is PlanStatus.CERTIFIED
+    assert outcome.terminal_time_used_s == pytest.approx(oracle.terminal_time_s, abs=0.005)
+    assert plan_of(outcome).terminal_time_s == outcome.terminal_time_used_s
+
+
+def test_random_states_of_the_box_are_certified(free: Planner) -> None:
+    rng = np.random.default_rng(31)
+    low = [5000.0, -600.0, -600.0, -150.0, -30.0, -30.0, 38000.0]
+    high = [5400.0, 600.0, 600.0, -120.0, 30.0, 30.0, 38000.0]
+    for state in rng.uniform(low, high, (25, 7)):
+        outcome = free.plan(state)
+        assert outcome.status is PlanStatus.CERTIFIED, f"{state}: {outcome.message}"
+
+
+@pytest.mark.parametrize("time_s", [31.0, 31.9, 32.0, 32.04])
+def test_too_little_time_is_infeasible(time_s: float) -> None:
+    planner = Planner(PlannerSettings(parameters={"terminal_time": time_s}))
+    outcome = planner.plan(planner.initial_state)
+    assert outcome.status is PlanStatus.INFEASIBLE
+    assert "no feasible trajectory" in outcome.message
+    assert outcome.terminal_time_used_s == time_s
+    assert outcome.virtual_control > 1e-6
+
+
+def test_least_terminal_time(fixed: Planner, free: Planner) -> None:
+    oracle = solve_least_time(PAPER_INITIAL_STATE)
+    assert oracle.status is Status.OPTIMAL
+    for planner in (fixed, free):
+        least = planner.least_terminal_time(START)
+        # The paper's grid is 0.01 s; local minima differ by 1e-3 s; the search stops at 1e-4 s.
+        assert least == pytest.approx(oracle.terminal_time_s, abs=0.005)
+    state = np.array([5200.0, 300.0, -400.0, -135.0, -10.0, 20.0, 38000.0])
+    other = solve_least_time(state)
+    assert other.status is Status.OPTIMAL
+    assert fixed.least_terminal_time(state) == pytest.approx(other.terminal_time_s, abs=0.005)
+
+
+def test_no_least_time_of_a_vehicle_that_cannot_brake() -> None:
+    planner = Planner(PlannerSettings(parameters={"thrust_max": 2.0e5, "initial_mass": 60000.0}))
+    assert planner.least_terminal_time(planner.initial_state) is None
+
+
+def test_least_time_of_a_bad_state(fixed: Planner) -> None:
+    with pytest.raises(InvalidInputError, match="mass"):
+        fixed.least_terminal_time(np.array([*START[:6], -1.0]))
+
+
+def test_warm_start_continues_the_plan(fixed: Planner, first: Plan) -> None:
+    for node in (0, 1, 8):
+        elapsed_s = float(first.times_s[node])
+        outcome = fixed.plan(first.states[node], warm_start=first, elapsed_s=elapsed_s)
+        assert outcome.status is PlanStatus.CERTIFIED, outcome.message
+        assert outcome.warm_started
+        # On the way, what is left of the flight time is used, not all of it again.
+        assert outcome.terminal_time_used_s == pytest.approx(32.81 - elapsed_s)
+        cold = Planner(PlannerSettings(parameters={"terminal_time": 32.81 - elapsed_s}))
+        reference = cold.plan(first.states[node])
+        assert outcome.iterations < reference.iterations
+        # The cost tolerance of 1e-8 of 32 t.
+        assert outcome.cost == pytest.approx(reference.cost, abs=1e-3)
+
+
+def test_warm_start_of_a_disturbed_state(free: Planner) -> None:
+    first = plan_of(free.plan(START))
+    state = first.states[3] + np.array([8.0, -5.0, 3.0, 0.5, -0.4, 0.3, -20.0])
+    warm = free.plan(state, warm_start=first, elapsed_s=float(first.times_s[3]))
+    cold = free.plan(state)
+    assert warm.status is cold.status is PlanStatus.CERTIFIED
+    assert warm.warm_started
+    assert warm.iterations < cold.iterations
+    # Flat mass: see test_powered_descent.
+    assert warm.terminal_time_used_s == pytest.approx(cold.terminal_time_used_s, abs=0.002)
+
+
+def test_warm_start_from_a_plan_with_other_nodes(fixed: Planner) -> None:
+    coarse = Planner(PlannerSettings(intervals=20))
+    outcome = fixed.plan(START, warm_start=plan_of(coarse.plan(START)))
+    assert outcome.status is PlanStatus.CERTIFIED
+    assert outcome.warm_started
+    assert len(plan_of(outcome).times_s) == 51
+
+
+def test_useless_warm_start_is_followed_by_a_cold_one(fixed: Planner, first: Plan) -> None:
+    # Late in the flight of another plan: far too little time from the start.
+    outcome = fixed.plan(START, warm_start=first, elapsed_s=5.0)
+    assert outcome.status is PlanStatus.INFEASIBLE
+    assert not outcome.warm_started
+    single = fixed.plan(START)
+    assert outcome.iterations > single.iterations  # those of both runs
+
+
+@pytest.mark.parametrize("elapsed_s", [-0.1, 32.0, 40.0, float("nan")])
+def test_stale_warm_start_is_left_alone(fixed: Planner, first: Plan, elapsed_s: float) -> None:
+    outcome = fixed.plan(START, warm_start=first, elapsed_s=elapsed_s)
+    assert outcome.status is PlanStatus.CERTIFIED
+    assert not outcome.warm_started
+    assert outcome.terminal_time_used_s == 32.81
+
+
+def test_warm_start_of_another_problem_is_left_alone(fixed: Planner, first: Plan) -> None:
+    outcome = fixed.plan(START, warm_start=replace(first, problem="entry"))
+    assert outcome.status is PlanStatus.CERTIFIED
+    assert not outcome.warm_started
+
+
+@pytest.mark.parametrize(
+    ("changes", "field"),
+    [
+        ({0: np.nan}, "x"),
+        ({4: np.inf}, "vy"),
+        ({6: -np.inf}, "mass"),
+        ({6: 0.0}, "initial_mass"),
+        ({6: -5.0}, "initial_mass"),
+        ({0: -1.5}, "x"),
+        ({1: 2e6}, "initial_position"),
+        ({5: 2e4}, "initial_velocity"),
+    ],
+)
+def test_bad_states_are_refused(fixed: Planner, changes: dict[int, float], field: str) -> None:
+    state = START.copy()
+    for index, value in changes.items():
+        state[index] = value
+    outcome = fixed.plan(state)
+    assert outcome.status is PlanStatus.INVALID_STATE
+    assert outcome.message.startswith(f"{field}: ")
+    assert outcome.plan is None
+    assert outcome.certificate is None
+    assert outcome.iterations == 0
+    with pytest.raises(InvalidInputError) as caught:
+        fixed.check_state(state)
+    assert caught.value.field == field
+    # The planner lives on.
+    assert fixed.plan(START).status is PlanStatus.CERTIFIED
+
+
+@pytest.mark.parametrize("state", [np.zeros(3), np.zeros((7, 1)), np.zeros(8)])
+def test_states_of_wrong_length_are_refused(fixed: Planner, state: Array) -> None:
+    outcome = fixed.plan(state)
+    assert outcome.status is PlanStatus.INVALID_STATE
+    assert "shape (7,)" in outcome.message
+
+
+def test_ground_is_where_the_landing_site_is() -> None:
+    planner = Planner(PlannerSettings(parameters={"final_position": [100.0, 0.0, 0.0]}))
+    state = START.copy()
+    # The certificate's metre is allowed.
+    state[0] = 98.5
+    outcome = planner.plan(state)
+    assert outcome.status is PlanStatus.INVALID_STATE
+    assert ">= 99 m" in outcome.message
+
+
+def test_hopeless_state_is_no_success(fixed: Planner) -> None:
+    # A hundred metres up at 150 m/s.
+    state = START.copy()
+    state[0] = 100.0
+    outcome = fixed.plan(state)
+    assert outcome.status in (PlanStatus.INFEASIBLE, PlanStatus.SOLVER_FAILURE)
+    assert outcome.message
+
+
+def test_deadline(fixed: Planner) -> None:
+    outcome = fixed.plan(START, deadline_s=1e-9)
+    assert outcome.status is PlanStatus.DEADLINE
+    assert outcome.plan is None
+    assert outcome.iterations == 0
+    assert fixed.plan(START, deadline_s=60.0).status is PlanStatus.CERTIFIED
+
+
+def test_deadline_does_not_stay(fixed: Planner) -> None:
+    fixed.plan(START, deadline_s=1e-9)
+    assert fixed.scp.options.deadline_s is None
+    assert fixed.plan(START).status is PlanStatus.CERTIFIED
+
+
+def test_iteration_limit_is_certified_by_the_flight_only() -> None:
+    # One iteration leaves the dynamics unmet; a certificate decides what such a plan is worth.
+    planner = Planner(PlannerSettings(options=ScpOptions(max_iterations=1)))
+    outcome = planner.plan(START)
+    assert outcome.iterations == 1
+    assert outcome.certificate is not None
+    assert outcome.status is (
+        PlanStatus.CERTIFIED if outcome.certificate.passed else PlanStatus.ITERATION_LIMIT
+    )
+    assert outcome.message.startswith("iteration limit")
+    if not outcome.certificate.passed:
+        assert "; certificate: " in outcome.message
+
+
+def test_converged_plan_may_fail_the_certificate() -> None:
+    # Ten intervals are too coarse for the flight to end where the nodes do.
+    planner = Planner(PlannerSettings(intervals=10))
+    outcome = planner.plan(START)
+    assert outcome.status is PlanStatus.NOT_CERTIFIED
+    assert outcome.certificate is not None
+    assert not outcome.certificate.passed
+    assert "miss_position" in outcome.message
+    assert outcome.plan is not None
+
+
+def test_solver_failure() -> None:
+    options = ScpOptions(solver="clarabel", solver_settings=SolverSettings(max_iterations=2))
+    outcome = Planner(PlannerSettings(options=options)).plan(START)
+    assert outcome.status is PlanStatus.SOLVER_FAILURE
+    assert outcome.plan is None
+    assert "clarabel" in outcome.message
+    assert outcome.cost == np.inf
+
+
+@pytest.mark.parametrize(
+    ("settings", "match"),
+    [
+        (PlannerSettings(problem="ascent"), "problem"),
+        (PlannerSettings(formulation="exact"), "formulation"),
+        (PlannerSettings(parameters={"thrust": 1.0}), "did you mean"),
+        (PlannerSettings(parameters={"thrust_max": -1.0}), "thrust_max"),
+        (PlannerSettings(intervals=1), "intervals"),
+        (PlannerSettings(options=ScpOptions(solver="mosek")), "mosek"),
+    ],
+)
+def test_bad_settings(settings: PlannerSettings, match: str) -> None:
+    with pytest.raises(InvalidInputError, match=match):
+        Planner(settings)
+
+
+def test_status_numbers_are_stable() -> None:
+    # They appear in reports and logs.
+    assert {status.name: status.value for status in PlanStatus} == {
+        "CERTIFIED": 0,
+        "NOT_CERTIFIED": 1,
+        "INFEASIBLE": 2,
+        "ITERATION_LIMIT": 3,
+        "DEADLINE": 4,
+        "SOLVER_FAILURE": 5,
+        "INVALID_STATE": 6,
+    }
+
+
+def test_settings_that_suit_a_problem_are_its_own() -> None:
+    entry = PlannerSettings.suited("entry", hold=ControlHold.LINEAR)
+    assert (entry.intervals, entry.terminal_time) == (100, TerminalTime.FREE)
+    assert entry.hold is ControlHold.LINEAR
+    assert PlannerSettings.suited("powered_descent") == PlannerSettings()
+    assert PlannerSettings.suited("entry", intervals=60).intervals == 60
