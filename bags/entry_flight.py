@@ -52,8 +52,7 @@ def entry_planner(**parameters: float) -> Planner:
     problem = problems.get("entry")
     values = {parameter.name: parameter.default for parameter in parameter_table(problem)}
     values |= {VEHICLE_PREFIX + name: value for name, value in parameters.items()}
-    formulation = problems.formulations("entry")[0]
-    return Planner(node_settings(problem, formulation, values).planner)
+    return Planner(problem, node_settings(problem, values).planner)
 
 
 @dataclass(frozen=True)

@@ -27,6 +27,7 @@ from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 
+from dscp_core import problems
 from dscp_core.planning.plan import PlanStatus
 from dscp_core.planning.planner import Planner, PlannerSettings, TerminalTime
 from dscp_core.problems.powered_descent.simulation import DescentRecord, Replan, simulate_descent
@@ -209,7 +210,9 @@ FAULTS: dict[int, Fault] = {
 def write_dispersed(folder: Path) -> Path:
     """Writes a series of unrelated initial states, some of them bad; returns the bag."""
     random = np.random.default_rng(DISPERSED_SEED)
-    layout = state_layout("powered_descent", Planner(PlannerSettings()).state_names)
+    layout = state_layout(
+        "powered_descent", Planner(problems.get("powered_descent"), PlannerSettings()).state_names
+    )
     bag = folder / DISPERSED
     with BagWriter(bag, overwrite=True) as writer:
         opening = f"{DISPERSED_STATES} unrelated initial states, seed {DISPERSED_SEED}"
@@ -229,7 +232,9 @@ def write_dispersed(folder: Path) -> Path:
 
 def write_ignitions(folder: Path) -> list[Path]:
     """Writes two series of unrelated states, in each of which the engine is lit."""
-    layout = state_layout("powered_descent", Planner(PlannerSettings()).state_names)
+    layout = state_layout(
+        "powered_descent", Planner(problems.get("powered_descent"), PlannerSettings()).state_names
+    )
     bags = []
     for number, (name, seed) in enumerate(IGNITIONS_SEEDS.items()):
         random = np.random.default_rng(seed)

@@ -10,6 +10,7 @@ import numpy as np
 from benchmarks.cases import Array, box_states
 from benchmarks.report import Cell, Report, Table
 from benchmarks.timing import clocked, median_ms, p99_ms
+from dscp_core import problems
 from dscp_core.planning.certificate import PlanVerifier
 from dscp_core.planning.plan import Plan, PlanStatus
 from dscp_core.planning.planner import Planner, PlannerSettings, TerminalTime
@@ -78,7 +79,10 @@ class _TimedPlanner:
 
     def __init__(self, solver: str) -> None:
         options = ScpOptions(solver=solver, cost_tolerance=1e-6)  # as the node's default
-        self._planner = Planner(PlannerSettings(terminal_time=TerminalTime.FREE, options=options))
+        self._planner = Planner(
+            problems.get("powered_descent"),
+            PlannerSettings(terminal_time=TerminalTime.FREE, options=options),
+        )
         intervals = self._planner.settings.intervals
         self._verifier = PlanVerifier(self._planner.problem, intervals)
         self._planner.plan(self._planner.initial_state)  # pays for the solver's set-up

@@ -9,6 +9,7 @@ import numpy as np
 
 from benchmarks.report import Cell, Report, Table
 from benchmarks.timing import Array, alternated, median_ms
+from dscp_core import problems
 from dscp_core.gradients.losses import FinalStateLoss
 from dscp_core.gradients.run import implicit, unrolled
 from dscp_core.planning.planner import Planner, PlannerSettings
@@ -27,7 +28,7 @@ def measure(*, quick: bool) -> Report:
     """Forward and backward runs of the paper's case, taking turns."""
     report = Report("phases")
     most = 4 if quick else 30
-    planner = Planner(PlannerSettings())
+    planner = Planner(problems.get("powered_descent"), PlannerSettings())
     forward_rows: list[tuple[Cell, ...]] = []
     backward_rows: list[tuple[Cell, ...]] = []
     for solver, share in SOLVERS.items():

@@ -12,13 +12,15 @@ from benchmarks.cases import box_states
 from benchmarks.report import Report
 from benchmarks.timing import Array, alternated, clocked, median_ms, p99_ms
 from dscp_core.learning.network_torch import TorchNetwork
-from dscp_core.problems.powered_descent.network import NetworkData, TerminalTimeNetwork
+from dscp_core.planning.terminal_time_network import NetworkData, TerminalTimeNetwork
 
 TIME_TARGET_MS = 0.2
 DIFFERENCE_TARGET = 1e-12
 STATES = 10000
 IMPORTS = (
-    "import sys, dscp_core.problems.powered_descent.network as t; t.TerminalTimeNetwork.load(); "
+    "import sys, dscp_core.planning.terminal_time_network as t; "
+    "from dscp_core.problems.powered_descent.definition import NETWORK; "
+    "t.TerminalTimeNetwork.load(NETWORK); "
     "print('torch' in sys.modules)"
 )
 

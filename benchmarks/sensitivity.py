@@ -11,6 +11,7 @@ import numpy as np
 from benchmarks.diffcp_program import MODES, DiffcpProgram
 from benchmarks.report import Cell, Report, Table
 from benchmarks.timing import Array, alternated, clocked
+from dscp_core import problems
 from dscp_core.cone.derivative.sensitivity import KktSystem
 from dscp_core.cone.program import ConeValues
 from dscp_core.cone.solvers import SOLVER_NAMES, SolverSettings, make_solver
@@ -29,7 +30,7 @@ DOT_PRODUCT_TARGET = 1e-10
 def measure(*, quick: bool) -> Report:
     """Time solve, linearisation and derivatives of the paper's last subproblem."""
     report = Report("sensitivity")
-    planner = Planner(PlannerSettings())
+    planner = Planner(problems.get("powered_descent"), PlannerSettings())
     pattern, layout = planner.transcription.pattern, planner.transcription.layout
     loop = Scp(planner.transcription, ScpOptions.for_gradients())
     last = loop.run(planner.parameters).iterations[-1]

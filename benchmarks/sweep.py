@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from benchmarks.report import Cell, Report, Table
+from dscp_core import problems
 from dscp_core.gradients.losses import FinalStateLoss
 from dscp_core.gradients.run import implicit, tangent, unrolled
 from dscp_core.planning.planner import Planner, PlannerSettings, TerminalTime
@@ -107,7 +108,7 @@ VIRTUAL_CONTROL = (Probe("virtual_control_weight", 0, 100.0, WEIGHT_STEP),)
 def measure(*, quick: bool) -> Report:
     """Sweep the terminal time, then the other parameters at fewer times."""
     report = Report("sweep")
-    planner = Planner(PlannerSettings())
+    planner = Planner(problems.get("powered_descent"), PlannerSettings())
     scp = Scp(planner.transcription, ScpOptions.for_gradients())
     times = np.linspace(FIRST_S, LAST_S, 20 if quick else 96)
     few = np.linspace(32.2, 33.9, 2 if quick else 12)
@@ -220,7 +221,9 @@ def _iterations(report: Report, planner: Planner, times_s: np.ndarray) -> None:
 
 
 def _optimum(report: Report) -> None:
-    planner = Planner(PlannerSettings(terminal_time=TerminalTime.FREE))
+    planner = Planner(
+        problems.get("powered_descent"), PlannerSettings(terminal_time=TerminalTime.FREE)
+    )
     result = planner.scp.run(planner.parameters)
     found_s = planner.transcription.terminal_time(result.final_reference, result.parameters)
     mass = FinalStateLoss("mass").value(planner.transcription, result)

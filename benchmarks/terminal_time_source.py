@@ -6,9 +6,11 @@ import numpy as np
 
 from benchmarks.cases import Array, box_states
 from benchmarks.report import Cell, Report, Table
+from dscp_core import problems
 from dscp_core.planning.plan import PlanOutcome, PlanStatus
 from dscp_core.planning.planner import Planner, PlannerSettings, TerminalTime
-from dscp_core.problems.powered_descent.network import TerminalTimeNetwork
+from dscp_core.planning.terminal_time_network import TerminalTimeNetwork
+from dscp_core.problems.powered_descent.definition import NETWORK
 from dscp_core.scp.scp import ScpOptions
 
 LIMITS = (1, 2, 3, 20)
@@ -22,14 +24,14 @@ def measure(*, quick: bool) -> Report:
     report = Report("terminal_time_source")
     states = box_states(25 if quick else 200, seed=15)
     best = _costs(states)
-    network = TerminalTimeNetwork.load()
+    network = TerminalTimeNetwork.load(NETWORK)
     rows: list[tuple[Cell, ...]] = []
     for limit in LIMITS:
         for source in (TerminalTime.FREE, TerminalTime.PREDICTED):
             options = ScpOptions(cost_tolerance=COST_TOLERANCE, max_iterations=limit)
             settings = PlannerSettings(terminal_time=source, options=options)
             predictor = network if source is TerminalTime.PREDICTED else None
-            planner = Planner(settings, predictor)
+            planner = Planner(problems.get("powered_descent"), settings, predictor)
             rows.append(_row(f"{source.value}, {limit}", [planner.plan(s) for s in states], best))
     report.tables.append(
         Table(
@@ -55,7 +57,9 @@ def measure(*, quick: bool) -> Report:
 
 def _costs(states: Array) -> Array:
     """(n,) optima in kg."""
-    planner = Planner(PlannerSettings(terminal_time=TerminalTime.FREE))
+    planner = Planner(
+        problems.get("powered_descent"), PlannerSettings(terminal_time=TerminalTime.FREE)
+    )
     return np.array([planner.plan(state).cost for state in states])
 
 

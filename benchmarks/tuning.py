@@ -114,9 +114,9 @@ def _objective(workers: int) -> Iterator[Objective]:
         parameters={"terminal_time": TIME_S},
         terminal_time=TerminalTime.FIXED,
     )
-    problem = problems.get(planner.problem)
+    problem = problems.get("powered_descent")
     space = SearchSpace(problem, parse_tuned(problem, TUNED), problem.pack(planner.parameters))
-    engine: Any = ProcessEngine(TuningModel(planner, LossChoice.parse("fuel")), workers)
+    engine: Any = ProcessEngine(TuningModel(problem, planner, LossChoice.parse("fuel")), workers)
     try:
         yield Objective(problem, engine, space, None, tunes_network=False)
     finally:

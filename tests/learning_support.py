@@ -12,10 +12,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from dscp_core import problems
 from dscp_core.errors import InvalidInputError
 from dscp_core.learning.recipes import Fit, Phase, Recipe, Refinement, Supervised
 from dscp_core.learning.sampling import PAPER_BOX
-from dscp_core.problems.powered_descent.network import FeatureMap, NetworkData, TerminalTimeNetwork
+from dscp_core.planning.terminal_time_network import FeatureMap, NetworkData, TerminalTimeNetwork
 
 if TYPE_CHECKING:
     from dscp_core.learning.training import TrainingSettings
@@ -112,5 +113,7 @@ def tiny_training(output: Path, **changes: object) -> TrainingSettings:
     """Settings of a tiny training."""
     from dscp_core.learning.training import TrainingSettings
 
-    settings = TrainingSettings(tiny_recipe(), output, {}, intervals=20, seed=1)
+    settings = TrainingSettings(
+        problems.get("powered_descent"), tiny_recipe(), output, {}, intervals=20, seed=1
+    )
     return replace(settings, **changes)  # type: ignore[arg-type]

@@ -16,7 +16,7 @@ from pathlib import Path
 from learning_support import network
 
 from dscp_core import problems
-from dscp_core.problems.powered_descent.network import TerminalTimeNetwork, vehicle_of
+from dscp_core.planning.terminal_time_network import TerminalTimeNetwork
 from dscp_ros.parameter_set import ParameterSetError, load, save
 
 OLD, NEW = {"intervals": 40}, {"intervals": 41}
@@ -25,7 +25,7 @@ OLD, NEW = {"intervals": 40}, {"intervals": 41}
 def fitting_network() -> TerminalTimeNetwork:
     """A network of the default vehicle."""
     table = problems.get("powered_descent").table
-    vehicle = vehicle_of(table.unpack(table.pack()))
+    vehicle = problems.get("powered_descent").vehicle_of(table.unpack(table.pack()))
     return TerminalTimeNetwork(replace(network().data, vehicle=vehicle))
 
 

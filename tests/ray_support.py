@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from dscp_core import problems
 from dscp_core.learning.evaluator import BestTimeJob, OptimumModel, Outcome
 from dscp_core.learning.sampling import PAPER_BOX
 from dscp_core.scp.scp import ScpOptions
@@ -72,7 +73,7 @@ class Located:
 
 def descents() -> Callable[[BestTimeJob], Located]:
     """Solves powered descents for their best time, coarsely."""
-    evaluate = OptimumModel(intervals=10)()
+    evaluate = OptimumModel(problems.get("powered_descent"), intervals=10)()
     names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "RAYON_NUM_THREADS")
 
     def located(job: BestTimeJob) -> Located:

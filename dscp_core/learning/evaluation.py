@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dscp_core import problems
 from dscp_core.learning.evaluator import BestTimeJob, Job, OptimumModel, Outcome
 from dscp_core.learning.labels import (
     TRUTH,
@@ -21,9 +20,8 @@ from dscp_core.learning.labels import (
 )
 from dscp_core.learning.nonlinear import NonlinearProgram
 from dscp_core.learning.run import Errors
+from dscp_core.planning.terminal_time_network import FeatureMap
 from dscp_core.problem.declaration import TERMINAL_TIME
-from dscp_core.problems import powered_descent
-from dscp_core.problems.powered_descent.network import FeatureMap
 from dscp_core.scp.scp import ScpOptions
 from dscp_core.workers.engine import Engine
 
@@ -188,19 +186,13 @@ def check_against_ipopt(
         progress: Told the number of states done with IPOPT.
     """
     best = Outcome.join(list(engine.map(best_time_jobs(states, TRUTH))))
-    problem = problems.get(powered_descent.NAME, model.formulation)
+    problem = model.problem
     base = problem.table.pack(model.parameters)
     program = NonlinearProgram(problem, model.intervals)
     times, masses = np.full(len(states), np.nan), np.full(len(states), np.nan)
     for row, state in enumerate(states):
         packed = problem.table.pack(
-            {
-                "initial_position": state[:3],
-                "initial_velocity": state[3:6],
-                "initial_mass": state[6],
-                TERMINAL_TIME: 34.0,
-            },
-            base=base,
+            {**problem.initial_state_values(state), TERMINAL_TIME: 34.0}, base=base
         )
         found = program.best_time(packed)
         if found is not None and best.converged[row]:

@@ -10,13 +10,11 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from dscp_core import problems
 from dscp_core.gradients.envelope import envelope_slope
 from dscp_core.gradients.losses import FinalStateLoss
 from dscp_core.gradients.run import DifferentiationError, unrolled
-from dscp_core.problem.declaration import TERMINAL_TIME
+from dscp_core.problem.declaration import TERMINAL_TIME, OptimalControlProblem
 from dscp_core.problem.parameters import Value
-from dscp_core.problems import powered_descent
 from dscp_core.scp.scp import Scp, ScpOptions
 from dscp_core.scp.trace import ScpResult, ScpStatus
 from dscp_core.transcription.transcription import Transcription
@@ -43,13 +41,13 @@ class OptimumModel:
     """The problem whose optimum is learnt. Calling it makes a worker's evaluator.
 
     Attributes:
+        problem: The declaration; its cost is minus the final mass, its last state.
         parameters: Vehicle, mission and algorithm parameters that differ from the defaults, SI.
-        formulation: Of the problem; None for the default.
         intervals: Number of intervals.
     """
 
+    problem: OptimalControlProblem
     parameters: Mapping[str, Value] = field(default_factory=dict)
-    formulation: str | None = None
     intervals: int = 50
 
     def __call__(self) -> OptimumEvaluator:
@@ -161,7 +159,7 @@ class OptimumEvaluator:
 
     def __init__(self, model: OptimumModel) -> None:
         self._model = model
-        self._problem = problems.get(powered_descent.NAME, model.formulation)
+        self._problem = model.problem
         self._base = self._problem.table.pack(model.parameters)
         self._transcriptions: dict[bool, Transcription] = {}
 
@@ -202,11 +200,7 @@ class OptimumEvaluator:
         return outcome
 
     def _pack(self, state: Array, time_s: float | None) -> Array:
-        changes: dict[str, Value] = {
-            "initial_position": state[0:3],
-            "initial_velocity": state[3:6],
-            "initial_mass": state[6],
-        }
+        changes: dict[str, Value] = {**self._problem.initial_state_values(state)}
         if time_s is not None:
             changes[TERMINAL_TIME] = time_s
         return self._problem.table.pack(changes, base=self._base)

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from dscp_core.problems.powered_descent.network import FeatureMap, NetworkData
+from dscp_core.planning.terminal_time_network import FeatureMap, NetworkData
 
 Array = NDArray[np.float64]
 

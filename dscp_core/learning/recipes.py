@@ -10,8 +10,8 @@ from typing import Any
 from dscp_core.errors import InvalidInputError
 from dscp_core.learning.evaluator import GradientMethod
 from dscp_core.learning.sampling import Mixture
+from dscp_core.planning.terminal_time_network import FeatureMap
 from dscp_core.problem.parameters import Value
-from dscp_core.problems.powered_descent.network import FeatureMap
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,6 @@ from typing import Any
 
 import torch
 
-from dscp_core import problems
 from dscp_core.errors import InvalidInputError
 from dscp_core.files import replace_file
 from dscp_core.learning.checkpoint import CHECKPOINT_FILE, CheckpointError
@@ -22,9 +21,9 @@ from dscp_core.learning.run import Errors, Run, stage
 from dscp_core.learning.sampling import PAPER_BOX
 from dscp_core.learning.stochastic import take_stochastic_steps
 from dscp_core.learning.supervised import supervise
+from dscp_core.planning.terminal_time_network import FeatureMap, TerminalTimeNetwork
+from dscp_core.problem.declaration import OptimalControlProblem
 from dscp_core.problem.parameters import Value
-from dscp_core.problems import powered_descent
-from dscp_core.problems.powered_descent.network import FeatureMap, TerminalTimeNetwork, vehicle_of
 from dscp_core.workers.choice import make_engine
 
 NETWORK_FILE = "terminal_time.safetensors"
@@ -38,6 +37,7 @@ class TrainingSettings:
     """What to train and where.
 
     Attributes:
+        problem: The declaration; see `OptimumModel`.
         recipe: How to train.
         output: Folder for network, history and checkpoint.
         parameters: Vehicle and mission parameters that differ from the defaults, SI.
@@ -49,6 +49,7 @@ class TrainingSettings:
         show_progress: Whether to draw progress bars.
     """
 
+    problem: OptimalControlProblem
     recipe: Recipe
     output: Path
     parameters: Mapping[str, Value]
@@ -92,10 +93,10 @@ def train(settings: TrainingSettings) -> TrainingResult:
     recipe = settings.recipe
     if settings.seed < 0:
         raise InvalidInputError("seed", settings.seed, ">= 0")
-    table = problems.get(powered_descent.NAME).table
+    table = settings.problem.table
     parameters = {**recipe.parameters, **settings.parameters}
     values = table.unpack(table.pack(parameters))
-    vehicle = vehicle_of(values)
+    vehicle = settings.problem.vehicle_of(values)
     if recipe.features is FeatureMap.AXISYMMETRIC:
         _require_symmetry(values)
     path = settings.output / CHECKPOINT_FILE
@@ -103,7 +104,7 @@ def train(settings: TrainingSettings) -> TrainingResult:
         raise CheckpointError(f"{path} exists: resume that training, or choose another folder")
     # Two threads add up in another order than one: results would depend on the machine.
     torch.set_num_threads(1)
-    model = OptimumModel(parameters=parameters, intervals=settings.intervals)
+    model = OptimumModel(settings.problem, parameters, settings.intervals)
     engine = make_engine(model, settings.workers, settings.ray_address)
     try:
         run = Run(

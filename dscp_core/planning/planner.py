@@ -12,12 +12,11 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from dscp_core import problems
 from dscp_core.errors import InvalidInputError
 from dscp_core.planning.attempt import Attempt, Start
 from dscp_core.planning.certificate import ControlHold, PlanVerifier
 from dscp_core.planning.plan import Plan, PlanOutcome, PlanStatus, TerminalTime
-from dscp_core.problem.declaration import TERMINAL_TIME
+from dscp_core.problem.declaration import TERMINAL_TIME, OptimalControlProblem
 from dscp_core.problem.parameters import Value
 from dscp_core.scp.scp import Scp, ScpOptions, ScpStatus
 from dscp_core.transcription.transcription import Transcription
@@ -50,11 +49,9 @@ class TerminalTimePredictor(Protocol):
 
 @dataclass(frozen=True)
 class PlannerSettings:
-    """What to plan and how; the defaults are those of powered descent, see `suited`.
+    """How to plan, and with which parameters; `suited` has what suits a problem.
 
     Attributes:
-        problem: Name of the problem.
-        formulation: Its formulation, or None for the default.
         parameters: Vehicle, mission and algorithm parameters that differ from the defaults, SI.
         intervals: Number N of intervals.
         terminal_time: Where the terminal time comes from.
@@ -62,8 +59,6 @@ class PlannerSettings:
         options: How to iterate; its deadline is set for every plan.
     """
 
-    problem: str = "powered_descent"
-    formulation: str | None = None
     parameters: Mapping[str, Value] = field(default_factory=dict)
     intervals: int = 50
     terminal_time: TerminalTime = TerminalTime.FIXED
@@ -71,25 +66,20 @@ class PlannerSettings:
     options: ScpOptions = field(default_factory=ScpOptions)
 
     @staticmethod
-    def suited(problem: str, formulation: str | None = None, **changes: Any) -> PlannerSettings:
+    def suited(problem: OptimalControlProblem, **changes: Any) -> PlannerSettings:
         """Settings with the number of intervals and the terminal time that suit a problem.
 
         Args:
-            problem: Name of the problem.
-            formulation: Its formulation, or None for the default.
+            problem: The declaration.
             **changes: Other attributes.
-
-        Raises:
-            InvalidInputError: Unknown problem or formulation.
         """
-        declared = problems.get(problem, formulation)
         own: dict[str, Any] = {
-            "intervals": declared.default_intervals,
+            "intervals": problem.default_intervals,
             "terminal_time": TerminalTime.FREE
-            if declared.free_terminal_time
+            if problem.free_terminal_time
             else TerminalTime.FIXED,
         }
-        return PlannerSettings(problem, formulation, **{**own, **changes})
+        return PlannerSettings(**{**own, **changes})
 
 
 @dataclass(frozen=True)
@@ -124,17 +114,22 @@ class Planner:
     """
 
     def __init__(
-        self, settings: PlannerSettings, predictor: TerminalTimePredictor | None = None
+        self,
+        problem: OptimalControlProblem,
+        settings: PlannerSettings | None = None,
+        predictor: TerminalTimePredictor | None = None,
     ) -> None:
         """Compile the problem.
 
         Args:
-            settings: What to plan and how.
+            problem: The declaration.
+            settings: How to plan; None for what suits the problem.
             predictor: Needed for, and only for, `TerminalTime.PREDICTED`.
 
         Raises:
-            InvalidInputError: Unknown problem, parameter or value, or a missing predictor.
+            InvalidInputError: Unknown parameter or value, or a missing predictor.
         """
+        settings = PlannerSettings.suited(problem) if settings is None else settings
         if (settings.terminal_time is TerminalTime.PREDICTED) != (predictor is not None):
             raise InvalidInputError(
                 "predictor",
@@ -143,7 +138,7 @@ class Planner:
             )
         self.settings = settings
         self._predictor = predictor
-        self.problem = problems.get(settings.problem, settings.formulation)
+        self.problem = problem
         self.parameters = self.problem.pack(settings.parameters)
         self.scp = self._loop(free=settings.terminal_time is TerminalTime.FREE)
         self.transcription = self.scp.transcription
@@ -332,7 +327,7 @@ class Planner:
                 cost_tolerance=3e-6,
             ),
         )
-        fastest = Planner(settings)
+        fastest = Planner(self.problem, settings)
         result = fastest.scp.run(fastest.check_state(state))
         if result.status is not ScpStatus.CONVERGED:
             return None

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from enum import Enum
 from pathlib import Path
 from typing import Any, TypeVar
 
 import casadi as ca
+import cloudpickle
 import numpy as np
 from numpy.typing import NDArray
 
 from dscp_core.errors import InvalidInputError
+from dscp_core.problem.extras import Extras
 from dscp_core.problem.parameters import Parameter, ParameterTable, Value, load_parameter_file
 
 Symbol = TypeVar("Symbol", ca.SX, ca.MX)
@@ -206,6 +208,8 @@ class OptimalControlProblem:
             none do.
         misses: Distances from the target that a certificate checks.
         control_states: Index of the state that each control acts on (for named-vector messages).
+        formulation: Which of several forms of the problem this is; empty where there is one.
+        extras: What it brings along, such as a figure of its own.
     """
 
     name: str
@@ -246,6 +250,8 @@ class OptimalControlProblem:
     least_time_parameters: Mapping[str, float] = field(default_factory=dict)
     misses: tuple[Miss, ...] = ()
     control_states: tuple[int, ...] = ()
+    formulation: str = ""
+    extras: Extras = field(default_factory=Extras)
     table: ParameterTable = field(init=False)
 
     def __post_init__(self) -> None:
@@ -264,6 +270,11 @@ class OptimalControlProblem:
         table = ParameterTable((*self.parameters, *self._scp_parameters()))
         table[TERMINAL_TIME]
         object.__setattr__(self, "table", table)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle with lambdas and closures, which plain pickle refuses."""
+        given = {f.name: getattr(self, f.name) for f in fields(self) if f.init}
+        return _restored, (cloudpickle.dumps(given),)
 
     def pack(self, values: Mapping[str, Value] | None = None) -> NDArray[np.float64]:
         """Packed parameters, SI: the defaults overridden by ``values``.
@@ -305,6 +316,19 @@ class OptimalControlProblem:
             start += self.table[name].size
         return values
 
+    def vehicle_of(self, values: Mapping[str, Any]) -> dict[str, float | list[float]]:
+        """The parameters that fix the optimum from a state, as JSON holds them.
+
+        Args:
+            values: Every parameter by name, SI.
+        """
+        others = {TERMINAL_TIME, *self.initial_state_parameters}
+        return {
+            p.name: np.asarray(values[p.name], dtype=np.float64).tolist()
+            for p in self.table.parameters
+            if p.fixes_optimum and p.name not in others
+        }
+
     def _scp_parameters(self) -> Sequence[Parameter]:
         """Parameters of the algorithm (theta_SCP), appended to those of the problem."""
         nx, nu = len(self.states), len(self.controls)
@@ -316,6 +340,7 @@ class OptimalControlProblem:
                 unit,
                 "Trust-region penalty per state, scaled cost per squared scaled state.",
                 lower=0.0,
+                fixes_optimum=False,
             ),
             Parameter(
                 TRUST_REGION_CONTROL,
@@ -323,6 +348,7 @@ class OptimalControlProblem:
                 unit,
                 "Trust-region penalty per control, scaled cost per squared scaled control.",
                 lower=0.0,
+                fixes_optimum=False,
             ),
             Parameter(
                 TRUST_REGION_STEP,
@@ -331,6 +357,7 @@ class OptimalControlProblem:
                 "Trust-region penalty on the terminal time, when it is free, scaled cost per "
                 "squared relative change.",
                 lower=0.0,
+                fixes_optimum=False,
             ),
         ]
         if any(self.virtual_control_scale):
@@ -341,6 +368,7 @@ class OptimalControlProblem:
                     "1",
                     "Penalty of the squared virtual control, in units of the cost.",
                     lower=0.0,
+                    fixes_optimum=False,
                 )
             )
         return parameters
@@ -349,3 +377,7 @@ class OptimalControlProblem:
 def named(problem: OptimalControlProblem, packed: Symbol) -> dict[str, Symbol]:
     """Parameters by name from their packed symbol."""
     return {name: packed[problem.table.slice(name)] for name in problem.table.names}
+
+
+def _restored(pickled: bytes) -> OptimalControlProblem:
+    return OptimalControlProblem(**cloudpickle.loads(pickled))

@@ -29,6 +29,8 @@ class Parameter:
         lower: Smallest admissible value of every component.
         upper: Largest admissible value of every component.
         source: Where the default comes from.
+        fixes_optimum: Whether the optimum from a state depends on it; not so for a bound on a
+            guess, or a setting of the method.
     """
 
     name: str
@@ -38,6 +40,7 @@ class Parameter:
     lower: float = -math.inf
     upper: float = math.inf
     source: str = ""
+    fixes_optimum: bool = True
 
     @property
     def size(self) -> int:

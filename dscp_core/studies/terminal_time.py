@@ -10,14 +10,14 @@ from statistics import fmean, median
 
 import numpy as np
 
-from dscp_core import problems
 from dscp_core.errors import InvalidInputError
 from dscp_core.gradients.differences import RunDifferences, relative_error
 from dscp_core.gradients.losses import FinalStateLoss
 from dscp_core.gradients.run import DifferentiationError, unrolled
 from dscp_core.planning.plan import PlanStatus
 from dscp_core.planning.planner import Planner, PlannerSettings, TerminalTime
-from dscp_core.problem.declaration import TERMINAL_TIME
+from dscp_core.problem.declaration import TERMINAL_TIME, OptimalControlProblem
+from dscp_core.problems.powered_descent import powered_descent
 from dscp_core.scp.scp import ScpOptions, ScpStatus
 from dscp_core.workers.choice import make_engine
 
@@ -41,6 +41,7 @@ class Sweep:
         stop_s: Last terminal time.
         step_s: Distance of neighbours.
         settings: The case; its options are replaced by those for gradients.
+        problem: What is swept.
 
     Raises:
         InvalidInputError: On construction, for a value out of range.
@@ -50,13 +51,14 @@ class Sweep:
     stop_s: float = 34.0
     step_s: float = 0.01
     settings: PlannerSettings = field(default_factory=PlannerSettings)
+    problem: OptimalControlProblem = field(default_factory=powered_descent)
 
     def __post_init__(self) -> None:
         for name in ("start_s", "stop_s", "step_s"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0.0):
                 raise InvalidInputError(name, value, "finite and > 0 s")
-        declared = problems.get(self.settings.problem, self.settings.formulation).table
+        declared = self.problem.table
         for value in (self.start_s, self.stop_s):
             declared[TERMINAL_TIME].validate(value)
         if self.stop_s < self.start_s:
@@ -180,7 +182,7 @@ def run_sweep(
     if jobs is not None and jobs < 1:
         raise InvalidInputError("jobs", jobs, ">= 1")
     points: list[SweepPoint] = []
-    engine = make_engine(SweepModel(sweep.settings), jobs, ray_address)
+    engine = make_engine(SweepModel(sweep.problem, sweep.settings), jobs, ray_address)
     try:
         for point in engine.map(sweep.times_s):
             points.append(point)
@@ -198,7 +200,7 @@ def summarise(sweep: Sweep, points: Sequence[SweepPoint]) -> SweepSummary:
     compared = [p for p in reliable if p.trusted and p.compared]
     worst = max(compared, key=lambda p: p.relative_error, default=None)
     best = max(feasible, key=lambda p: p.final_mass_kg, default=None)
-    planner = Planner(replace(sweep.settings, terminal_time=TerminalTime.FREE))
+    planner = Planner(sweep.problem, replace(sweep.settings, terminal_time=TerminalTime.FREE))
     free = planner.plan(planner.initial_state)
     optimum = free.plan if free.status is PlanStatus.CERTIFIED else None
     return SweepSummary(
@@ -228,16 +230,18 @@ class SweepModel:
     """What a worker of the sweep needs. Calling it makes its function.
 
     Attributes:
+        problem: Of the sweep.
         settings: Of the sweep.
     """
 
+    problem: OptimalControlProblem
     settings: PlannerSettings
 
     def __call__(self) -> Callable[[float], SweepPoint]:
         """Compile the problem."""
         options = ScpOptions.for_gradients(solver=self.settings.options.solver)
         fixed = replace(self.settings, terminal_time=TerminalTime.FIXED, options=options)
-        planner = Planner(fixed)
+        planner = Planner(self.problem, fixed)
         return lambda time_s: _point(planner, time_s)
 
 

@@ -10,7 +10,6 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from dscp_core import problems
 from dscp_core.cone.solvers import SolverSettings
 from dscp_core.gradients.envelope import envelope_gradient, envelope_slope
 from dscp_core.gradients.run import DifferentiationError, unrolled
@@ -33,7 +32,8 @@ class TuningModel:
     """What is evaluated. Calling it makes a worker's evaluator.
 
     Attributes:
-        planner: What to plan and how.
+        problem: What to plan.
+        planner: How to plan it.
         loss: What is minimised.
         fixed_iterations: Iterations of every differentiated run, or None: until it has converged.
         envelope: Differentiate by the multipliers of the converged run instead of through its
@@ -41,6 +41,7 @@ class TuningModel:
             then start from a trajectory of an earlier one.
     """
 
+    problem: OptimalControlProblem
     planner: PlannerSettings
     loss: LossChoice
     fixed_iterations: int | None = None
@@ -169,7 +170,7 @@ class StateEvaluator:
     def __init__(self, model: TuningModel) -> None:
         self._model = model
         planner = model.planner
-        self._problem = problems.get(planner.problem, planner.formulation)
+        self._problem = model.problem
         self._transcription = Transcription(
             self._problem,
             planner.intervals,

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from dscp_core.learning.network_torch import TorchNetwork
-from dscp_core.problems.powered_descent.network import NetworkData, TerminalTimeNetwork, vehicle_of
+from dscp_core.planning.terminal_time_network import NetworkData, TerminalTimeNetwork
 
 
 def trainable(data: NetworkData) -> TorchNetwork:
@@ -30,21 +30,21 @@ def trainable(data: NetworkData) -> TorchNetwork:
 
 
 def exported(
-    network: TorchNetwork, origin: NetworkData, values: Mapping[str, Any], provenance: Any
+    network: TorchNetwork, origin: NetworkData, vehicle: Mapping[str, Any], provenance: Any
 ) -> TerminalTimeNetwork:
     """The tuned network, valid where the original was.
 
     Args:
         network: Tuned.
         origin: What it was made from.
-        values: All parameters of the problem by name, SI, tuned.
+        vehicle: What `OptimalControlProblem.vehicle_of` gives for the tuned parameters.
         provenance: Of the tuning, JSON.
     """
     return TerminalTimeNetwork(
         network.export(
             lower=origin.lower,
             upper=origin.upper,
-            vehicle=vehicle_of(values),
+            vehicle=vehicle,
             intervals=origin.intervals,
             provenance={**origin.provenance, "tuning": provenance},
         )

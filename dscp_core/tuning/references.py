@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from dscp_core import problems
 from dscp_core.files import FileWriteError
 from dscp_core.planning.planner import PlannerSettings, TerminalTime
+from dscp_core.problem.declaration import OptimalControlProblem
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.intp]
@@ -86,8 +86,7 @@ def reference_files(folder: Path) -> tuple[Path, Path]:
     return folder / "references.even.bin", folder / "references.odd.bin"
 
 
-def reference_size(planner: PlannerSettings) -> int:
+def reference_size(problem: OptimalControlProblem, planner: PlannerSettings) -> int:
     """Length R of the scaled reference vectors of a planner."""
-    problem = problems.get(planner.problem, planner.formulation)
     free = planner.terminal_time is TerminalTime.FREE
     return int(free) + (planner.intervals + 1) * (len(problem.states) + len(problem.controls))

@@ -9,11 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dscp_core import problems
 from dscp_core.errors import InvalidInputError
 from dscp_core.planning.planner import TerminalTime
+from dscp_core.planning.terminal_time_network import TerminalTimeNetwork
 from dscp_core.problem.declaration import TERMINAL_TIME, OptimalControlProblem
-from dscp_core.problems.powered_descent.network import TerminalTimeNetwork
 from dscp_core.tuning.settings import Sample, TuningSettings
 
 Array = NDArray[np.float64]
@@ -86,8 +85,7 @@ def screen(
     Raises:
         InvalidInputError: Unknown problem, or an invalid parameter.
     """
-    planner = settings.planner
-    problem = problems.get(planner.problem, planner.formulation)
+    problem, planner = settings.problem, settings.planner
     base = problem.pack(planner.parameters)
     good: list[Sample] = []
     refused: list[Refusal] = []

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from dscp_core.errors import InvalidInputError
 from dscp_core.planning.planner import PlannerSettings
+from dscp_core.problem.declaration import OptimalControlProblem
 from dscp_core.tuning.quantities import TunedParameter
 
 Array = NDArray[np.float64]
@@ -41,7 +42,8 @@ class TuningSettings:
     """What to tune and how.
 
     Attributes:
-        planner: What is planned, and how the result is judged.
+        problem: What is planned.
+        planner: How it is planned, and how the result is judged.
         tuned: Quantities, see `dscp_core.tuning.quantities.parse_tuned`.
         output: Folder of the checkpoint.
         loss: One of `dscp_core.tuning.choice.LOSSES`, or ``FILE.py:FUNCTION``.
@@ -65,6 +67,7 @@ class TuningSettings:
         show_progress: Whether to draw progress bars.
     """
 
+    problem: OptimalControlProblem
     planner: PlannerSettings
     tuned: tuple[TunedParameter, ...]
     output: Path

@@ -14,12 +14,11 @@ import torch
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from dscp_core import problems
 from dscp_core.errors import InvalidInputError
 from dscp_core.learning.checkpoint import CheckpointError
 from dscp_core.planning.planner import TerminalTime
+from dscp_core.planning.terminal_time_network import TerminalTimeNetwork
 from dscp_core.problem.declaration import TERMINAL_TIME, OptimalControlProblem
-from dscp_core.problems.powered_descent.network import TerminalTimeNetwork
 from dscp_core.tuning.assessment import Evaluation, improved
 from dscp_core.tuning.choice import LossChoice, cost_is_minus_mass
 from dscp_core.tuning.errors import TuningError
@@ -106,8 +105,7 @@ def tune(
         FileWriteError: The checkpoint cannot be written.
         WorkerLostError: Workers keep dying.
     """
-    planner = settings.planner
-    problem = problems.get(planner.problem, planner.formulation)
+    problem, planner = settings.problem, settings.planner
     _check(settings, problem, network)
     loss = LossChoice.parse(settings.loss)
     base = problem.pack(planner.parameters)
@@ -124,7 +122,7 @@ def tune(
     judged = StateSet.of(unseen, given_times=given)
     predictor = None if network is None else trainable(network.data)
     warm = _warm(settings, problem, loss, base)
-    model = TuningModel(planner, loss, settings.fixed_iterations, envelope=warm)
+    model = TuningModel(problem, planner, loss, settings.fixed_iterations, envelope=warm)
     identity = _identity(settings, loss, base, states, network)
     engine = make_engine(model, settings.workers, settings.ray_address)
     try:
@@ -137,7 +135,9 @@ def tune(
             states,
             identity=identity,
             counts_iterations=loss.counts_iterations,
-            store=ReferenceStore(settings.output, reference_size(planner)) if warm else None,
+            store=ReferenceStore(settings.output, reference_size(problem, planner))
+            if warm
+            else None,
         )
         if settings.resume:
             search.resume()
@@ -193,7 +193,7 @@ def _check(
     # A network that is tuned may start from another vehicle's.
     if network is not None and not settings.tunes_network:
         values = problem.table.unpack(problem.pack(settings.planner.parameters))
-        network.check_vehicle(values)
+        network.check_vehicle(problem.vehicle_of(values))
     check_corners(problem, settings.tuned, settings.planner.parameters)
 
 
@@ -272,7 +272,9 @@ def _tuned_network(
 ) -> TerminalTimeNetwork | None:
     if network is None or not settings.tunes_network:
         return None
-    return exported(predictor, network.data, problem.table.unpack(tuned), identity)
+    return exported(
+        predictor, network.data, problem.vehicle_of(problem.table.unpack(tuned)), identity
+    )
 
 
 def _identity(
@@ -291,8 +293,8 @@ def _identity(
     for array in arrays:
         digest.update(np.ascontiguousarray(array).tobytes())
     return {
-        "problem": planner.problem,
-        "formulation": planner.formulation,
+        "problem": settings.problem.name,
+        "formulation": settings.problem.formulation,
         "intervals": planner.intervals,
         "terminal_time": planner.terminal_time.value,
         "hold": planner.hold.value,

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from dscp_core.errors import InvalidInputError
 
 if TYPE_CHECKING:
-    from dscp_core.planning.planner import PlannerSettings
+    from dscp_core.planning.planner import Planner
     from dscp_core.problem.declaration import OptimalControlProblem
     from dscp_core.problem.parameters import Parameter, Value
     from dscp_core.scp.scp import ScpOptions
@@ -133,8 +133,8 @@ def parse_assignments(assignments: Sequence[str]) -> dict[str, Value]:
     return values
 
 
-def planner_settings(args: argparse.Namespace, options: ScpOptions) -> PlannerSettings:
-    """Settings of the case.
+def case_planner(args: argparse.Namespace, options: ScpOptions) -> Planner:
+    """Planner of the case.
 
     Args:
         args: Parsed arguments.
@@ -146,7 +146,7 @@ def planner_settings(args: argparse.Namespace, options: ScpOptions) -> PlannerSe
     from dataclasses import replace
 
     from dscp_core import problems
-    from dscp_core.planning.planner import PlannerSettings, TerminalTime
+    from dscp_core.planning.planner import Planner, PlannerSettings, TerminalTime
 
     problem = problems.get(args.problem, args.formulation)
     intervals = problem.default_intervals if args.intervals is None else args.intervals
@@ -157,14 +157,13 @@ def planner_settings(args: argparse.Namespace, options: ScpOptions) -> PlannerSe
         free = args.free_terminal_time
     if args.solver is not None:
         options = replace(options, solver=args.solver)
-    return PlannerSettings(
-        problem=args.problem,
-        formulation=args.formulation,
+    settings = PlannerSettings(
         parameters=overrides(args, problem),
         intervals=intervals,
         terminal_time=TerminalTime.FREE if free else TerminalTime.FIXED,
         options=options,
     )
+    return Planner(problem, settings)
 
 
 def print_parameters(args: argparse.Namespace) -> None:

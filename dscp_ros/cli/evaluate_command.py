@@ -17,7 +17,7 @@ from dscp_ros.cli.arguments import overrides, print_json, print_table
 if TYPE_CHECKING:
     from dscp_core.learning.evaluation import Measurement
     from dscp_core.learning.evaluator import Job, OptimumModel, Outcome
-    from dscp_core.problems.powered_descent.network import TerminalTimeNetwork
+    from dscp_core.planning.terminal_time_network import TerminalTimeNetwork
     from dscp_core.workers.engine import Engine
 
 DESCRIPTION = "Measures what was learnt against brute force."
@@ -132,17 +132,21 @@ def run_terminal_time(args: argparse.Namespace) -> int:
         raise InvalidInputError("--output", str(args.output), "a directory")
     from dscp_core import problems
     from dscp_core.learning.evaluator import OptimumModel
-    from dscp_core.problems import powered_descent
-    from dscp_core.problems.powered_descent.network import DEFAULT_NETWORK, TerminalTimeNetwork
+    from dscp_core.planning.terminal_time_network import TerminalTimeNetwork
     from dscp_core.workers.choice import make_engine
 
-    table = problems.get(powered_descent.NAME).table
+    problem = problems.get(problems.DEFAULT)
     parameters = overrides(args)
+    shipped = args.network or problem.extras.network
+    if shipped is None:
+        raise InvalidInputError("NETWORK", None, f"a file: {problem.name} ships no network")
     network = TerminalTimeNetwork.load(
-        DEFAULT_NETWORK if args.network is None else args.network,
-        vehicle=table.unpack(table.pack(parameters)),
+        shipped,
+        vehicle=problem.vehicle_of(problem.table.unpack(problem.table.pack(parameters))),
     )
-    model = OptimumModel({**parameters, "mean_thrust_fraction": 1.0}, None, network.data.intervals)
+    model = OptimumModel(
+        problem, {**parameters, "mean_thrust_fraction": 1.0}, network.data.intervals
+    )
     rng = np.random.default_rng(args.seed)
     engine = make_engine(model, args.workers, args.ray)
     try:
@@ -172,7 +176,7 @@ def _measure(
     """Errors and fuel on every set."""
     from dscp_core.learning import evaluation
     from dscp_core.learning.sampling import PAPER_BOX, horizontal_profile, vertical_profile
-    from dscp_core.problems.powered_descent.network import FeatureMap
+    from dscp_core.planning.terminal_time_network import FeatureMap
 
     sets = {
         "vertical": vertical_profile(PROFILE_POINTS),

@@ -10,7 +10,7 @@ from dscp_core.errors import InvalidInputError
 from dscp_ros.cli import ExitCode
 from dscp_ros.cli.arguments import (
     add_case_arguments,
-    planner_settings,
+    case_planner,
     print_json,
     print_parameters,
     print_table,
@@ -112,14 +112,13 @@ def run(args: argparse.Namespace) -> int:
         print_parameters(args)
         return ExitCode.OK
     _require(args)
-    from dscp_core.planning.planner import Planner
     from dscp_core.scp.scp import ScpOptions
     from dscp_ros.cli.gradient_report import check, differentiate
 
     fixed = args.iterations
     if fixed is None and args.method == "implicit":
         fixed = IMPLICIT_ITERATIONS
-    planner = Planner(planner_settings(args, ScpOptions.for_gradients(fixed_iterations=fixed)))
+    planner = case_planner(args, ScpOptions.for_gradients(fixed_iterations=fixed))
     names = tuple(dict.fromkeys(args.wrt))
     for name in names:
         planner.problem.table.slice(name)

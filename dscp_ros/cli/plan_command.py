@@ -13,7 +13,7 @@ from dscp_core.errors import InvalidInputError
 from dscp_ros.cli import ExitCode
 from dscp_ros.cli.arguments import (
     add_case_arguments,
-    planner_settings,
+    case_planner,
     print_json,
     print_parameters,
     print_table,
@@ -96,16 +96,16 @@ def run(args: argparse.Namespace) -> int:
         return ExitCode.OK
     _check(args)
     from dscp_core.planning.plan import PlanStatus
-    from dscp_core.planning.planner import Planner, TerminalTime
+    from dscp_core.planning.planner import TerminalTime
     from dscp_core.scp.scp import ScpOptions
 
-    planner = Planner(planner_settings(args, ScpOptions()))
+    planner = case_planner(args, ScpOptions())
     planner.check_state(planner.initial_state)
     outcome = planner.plan(planner.initial_state, deadline_s=args.deadline)
     least = None
     without_answer = outcome.status not in (PlanStatus.CERTIFIED, PlanStatus.DEADLINE)
     if without_answer and planner.settings.terminal_time is not TerminalTime.FREE:
-        least = _least_terminal_time(planner)
+        least = _least_terminal_time(args, planner)
         outcome = _name_least(outcome, least)
     described = describe(planner, outcome, least)
     written = _write(args, planner, outcome, described)
@@ -124,14 +124,12 @@ def describe(planner: Planner, outcome: PlanOutcome, least_s: float | None) -> d
         outcome: What became of the attempt.
         least_s: Least feasible terminal time, where it was looked for and found.
     """
-    from dscp_core import problems
     from dscp_core.planning.plan import PlanStatus
 
     settings, plan = planner.settings, _flyable(outcome)
-    formulation = settings.formulation or problems.formulations(settings.problem)[0]
     return {
-        "problem": settings.problem,
-        "formulation": formulation,
+        "problem": planner.problem.name,
+        "formulation": planner.problem.formulation or None,
         "status": outcome.status,
         "message": outcome.message,
         "certified": outcome.status is PlanStatus.CERTIFIED,
@@ -162,16 +160,17 @@ def _check(args: argparse.Namespace) -> None:
         check_output_path("--output", args.output, (".csv", ".json"))
 
 
-def _least_terminal_time(planner: Planner) -> float | None:
+def _least_terminal_time(args: argparse.Namespace, planner: Planner) -> float | None:
     """Least feasible terminal time, by the default formulation: the printed one cannot find it."""
+    from dscp_core import problems
     from dscp_core.planning.planner import Planner as DefaultPlanner
     from dscp_core.problem.declaration import TERMINAL_TIME
 
-    settings = replace(planner.settings, formulation=None)
+    problem, settings = problems.get(args.problem), planner.settings
     others = {n: v for n, v in settings.parameters.items() if n != TERMINAL_TIME}
     # The case's own time is the first guess; one that is far too short leads nowhere.
     for parameters in (settings.parameters, others):
-        search = DefaultPlanner(replace(settings, parameters=parameters))
+        search = DefaultPlanner(problem, replace(settings, parameters=parameters))
         least = search.least_terminal_time(search.initial_state)
         if least is not None:
             return least
@@ -233,10 +232,13 @@ def _write(
     if args.output is not None:
         write_trajectory(args.output, plan, planner.problem, described)
     if args.plot is not None:
-        from dscp_core.planning.panels import plan_figure
+        from dscp_core.planning.histories import plan_figure
 
         figure = plan_figure(
-            plan, outcome.certificate, planner.problem.table.unpack(planner.parameters)
+            planner.problem,
+            plan,
+            outcome.certificate,
+            planner.problem.table.unpack(planner.parameters),
         )
         with complete_file(args.plot) as partial:
             figure.savefig(partial)
@@ -245,8 +247,9 @@ def _write(
 
 def _print(described: dict[str, Any]) -> None:
     status, certificate = described["status"], described["certificate"]
+    form = f"{described['formulation']}, " if described["formulation"] else ""
     print(
-        f"{described['problem']} ({described['formulation']}, {described['intervals']} intervals): "
+        f"{described['problem']} ({form}{described['intervals']} intervals): "
         f"{_STATUS_WORDS[status.name.lower()]}"
     )
     rows = [

@@ -121,6 +121,7 @@ def run_terminal_time(args: argparse.Namespace) -> int:
     """
     if args.output.exists() and not args.output.is_dir():
         raise InvalidInputError("--output", str(args.output), "a directory")
+    from dscp_core import problems
     from dscp_core.learning.figures import training_figure, write_figure
     from dscp_core.learning.recipes import adjusted, recipe
     from dscp_core.learning.training import TrainingSettings, train
@@ -134,6 +135,7 @@ def run_terminal_time(args: argparse.Namespace) -> int:
     )
     result = train(
         TrainingSettings(
+            problem=problems.get(problems.DEFAULT),
             recipe=chosen,
             output=args.output,
             parameters=overrides(args),

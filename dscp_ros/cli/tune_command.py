@@ -269,6 +269,7 @@ def _settings(args: argparse.Namespace, start: Start) -> TuningSettings:
     check_tuned(start, tuned)
     output = args.output.absolute()
     return TuningSettings(
+        problem=start.values.problem,
         planner=start.values.planner,
         tuned=tuned,
         output=output.with_name(f"{output.name}.tuning"),

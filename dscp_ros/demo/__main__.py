@@ -184,7 +184,7 @@ def _run_loop(
 def _run(case: DemoCase, folder: Path, paths: Sequence[Path], rate: float, timeout_s: float) -> int:
     say = _teller()
     _isolate(folder)
-    from dscp_core.planning.panels import plan_figure
+    from dscp_core.planning.histories import plan_figure
     from dscp_ros.demo.recorded import recorded_plan
     from dscp_ros.demo.session import open_input, run_session
     from dscp_ros.demo.summary import figures_of, read_reports, table
@@ -208,7 +208,7 @@ def _run(case: DemoCase, folder: Path, paths: Sequence[Path], rate: float, timeo
         return _fail("no certified plan came out", ExitCode.NO_PLAN)
     picture = folder / case.picture
     with complete_file(picture) as partial:
-        plan_figure(found.plan, found.certificate, found.parameters).savefig(partial)
+        plan_figure(found.problem, found.plan, found.certificate, found.parameters).savefig(partial)
     say(f"drew the plan from {case.start_text(found.report.state)}; results:")
     print(f"  {recording}\n  {picture}")
     if not found.certificate.passed:

@@ -10,6 +10,7 @@ from typing import Any
 from dscp_core import problems
 from dscp_core.planning.certificate import PlanCertificate, PlanVerifier
 from dscp_core.planning.plan import Plan
+from dscp_core.problem.declaration import OptimalControlProblem
 from dscp_ros.bag import BagReader
 from dscp_ros.demo.session import TRAJECTORY
 from dscp_ros.demo.summary import Figures
@@ -24,12 +25,14 @@ class RecordedPlan:
     """A published plan.
 
     Attributes:
+        problem: What was planned.
         plan: As published.
         report: As published.
         certificate: Of the plan as it was read back.
         parameters: Vehicle and mission that it was made for, SI, by name.
     """
 
+    problem: OptimalControlProblem
     plan: Plan
     report: PlanReport
     certificate: PlanCertificate
@@ -70,5 +73,5 @@ def recorded_plan(
             packed = problem.table.pack()
             verifier = PlanVerifier(problem, len(plan.times_s) - 1)
             certificate = verifier.certify(plan.times_s, plan.states, plan.controls, packed)
-            return RecordedPlan(plan, report, certificate, problem.table.unpack(packed))
+            return RecordedPlan(problem, plan, report, certificate, problem.table.unpack(packed))
     return None

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from dscp_core.errors import DscpError, InvalidInputError
-from dscp_core.problems.powered_descent.network import TerminalTimeNetwork, vehicle_of
+from dscp_core.planning.terminal_time_network import TerminalTimeNetwork
 from dscp_ros.parameter_set.errors import ParameterSetError
 from dscp_ros.parameter_set.format import (
     NETWORK_FILE,
@@ -57,16 +57,16 @@ class ParameterSet:
         """Name for reports."""
         return f"{self.directory.absolute().name}@{self.identifier}"
 
-    def check_vehicle(self, parameters: Mapping[str, Any]) -> None:
+    def check_vehicle(self, vehicle: Mapping[str, Any]) -> None:
         """Refuse a vehicle that the set was not made for.
 
         Args:
-            parameters: All parameters of the problem by name, SI, in the core's axes.
+            vehicle: What `OptimalControlProblem.vehicle_of` gives.
 
         Raises:
             ParameterSetError: One that fixes the optimum has another value.
         """
-        _check_vehicle(self.vehicle, vehicle_of(parameters), str(self.directory))
+        _check_vehicle(self.vehicle, vehicle, str(self.directory))
 
 
 def directory_of(parameter_file: str | Path) -> Path | None:
@@ -167,7 +167,7 @@ def _check_agreement(snapshot: Path, provenance: Mapping[str, Any], values: Chec
 
 def _network(snapshot: Path, values: CheckedValues) -> TerminalTimeNetwork:
     try:
-        return TerminalTimeNetwork.load(snapshot / NETWORK_FILE, values.parameters)
+        return TerminalTimeNetwork.load(snapshot / NETWORK_FILE, values.vehicle)
     except FileNotFoundError:
         raise ParameterSetError(f"{snapshot / NETWORK_FILE}: not readable") from None
 

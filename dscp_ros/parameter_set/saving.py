@@ -11,7 +11,7 @@ from typing import Any
 
 from dscp_core.errors import DscpError
 from dscp_core.files import replace_file
-from dscp_core.problems.powered_descent.network import TerminalTimeNetwork
+from dscp_core.planning.terminal_time_network import TerminalTimeNetwork
 from dscp_ros.parameter_set.errors import ParameterSetError
 from dscp_ros.parameter_set.format import (
     FORMAT,

@@ -10,7 +10,6 @@ from typing import Any
 from dscp_core import problems
 from dscp_core.planning.planner import PlannerSettings
 from dscp_core.problem.declaration import OptimalControlProblem
-from dscp_core.problems.powered_descent.network import vehicle_of
 from dscp_ros.planner.declaration import NodeParameter
 from dscp_ros.planner.parameter_files import check_parameter_names, read_file
 from dscp_ros.planner.parameters import (
@@ -56,7 +55,7 @@ class CheckedValues:
     @property
     def vehicle(self) -> dict[str, float | list[float]]:
         """Those of them that fix the optimum."""
-        return vehicle_of(self.parameters)
+        return self.problem.vehicle_of(self.parameters)
 
 
 def read_values(path: Path) -> CheckedValues:
@@ -83,7 +82,7 @@ def check_values(given: Mapping[str, Any]) -> CheckedValues:
     table = {p.name: p for p in (PROBLEM, formulation, *parameter_table(problem))}
     check_parameter_names(list(given), list(table))
     values = {name: _checked(parameter, given) for name, parameter in table.items()}
-    settings = node_settings(problem, values[formulation.name], values)
+    settings = node_settings(problem, values)
     return CheckedValues(problem, values[formulation.name], dict(given), values, settings)
 
 

@@ -162,7 +162,7 @@ class ParameterServer:
 
     def _read(self) -> _Origin:
         sources = read_sources(self._arguments, self._node.get_fully_qualified_name())
-        return _Origin(sources, Predictors(self.problem.name, sources.network))
+        return _Origin(sources, Predictors(self.problem.extras.network, sources.network))
 
     def _declare(self, parameter: NodeParameter) -> Any:
         """Declare one parameter and return its checked value."""
@@ -197,7 +197,7 @@ class ParameterServer:
         return self._values() | known
 
     def _settings_of(self, values: Mapping[str, Any]) -> NodeSettings:
-        return node_settings(self.problem, self._formulation, values)
+        return node_settings(self.problem, values)
 
     def _setup_of(
         self, settings: NodeSettings, values: Mapping[str, Any], origin: _Origin
@@ -212,11 +212,14 @@ class ParameterServer:
         predictor = None
         if settings.planner.terminal_time is TerminalTime.PREDICTED:
             predictor = origin.predictors.predictor(values[NETWORK], vehicle)
-        return PlannerSetup(settings.planner, predictor, origin.sources.label(values, vehicle))
+        return PlannerSetup(
+            self.problem, settings.planner, predictor, origin.sources.label(values, vehicle)
+        )
 
     def _vehicle(self, settings: NodeSettings) -> dict[str, Any]:
-        """Every parameter of the problem by name, SI, in the core's axes."""
-        return dict(self.problem.table.unpack(self.problem.pack(settings.planner.parameters)))
+        """The parameters that fix the optimum, by name, SI, in the core's axes."""
+        packed = self.problem.pack(settings.planner.parameters)
+        return self.problem.vehicle_of(self.problem.table.unpack(packed))
 
     def _take_over(self, values: Mapping[str, Any]) -> None:
         settings = self._settings_of(values)

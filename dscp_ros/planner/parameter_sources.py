@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from dscp_core.problems.powered_descent.network import vehicle_of
 from dscp_ros.parameter_set import ParameterSet, directory_of, load
 from dscp_ros.planner.interfaces import VEHICLE_PREFIX
 from dscp_ros.planner.parameter_files import ParameterArguments, read_file
@@ -32,32 +31,30 @@ class ParameterSources:
     sets: tuple[ParameterSet, ...]
     network: NamedNetwork | None
 
-    def check_vehicle(self, parameters: Mapping[str, Any]) -> None:
+    def check_vehicle(self, vehicle: Mapping[str, Any]) -> None:
         """Refuse a vehicle that a set was not made for.
 
         Args:
-            parameters: All parameters of the problem by name, SI, in the core's axes.
+            vehicle: What `OptimalControlProblem.vehicle_of` gives.
 
         Raises:
             ParameterSetError: A set is of another vehicle.
         """
         for parameter_set in self.sets:
-            parameter_set.check_vehicle(parameters)
+            parameter_set.check_vehicle(vehicle)
 
-    def label(self, values: Mapping[str, Any], parameters: Mapping[str, Any]) -> str:
+    def label(self, values: Mapping[str, Any], vehicle: Mapping[str, Any]) -> str:
         """Names the sets for reports, with what of them does not count (any more).
 
         Args:
             values: Node parameters in use.
-            parameters: All parameters of the problem by name, SI, in the core's axes.
+            vehicle: What `OptimalControlProblem.vehicle_of` gives.
         """
         labels = []
         for one in self.sets:
             changed = _differing(one.values, values)
-            vehicle = (
-                VEHICLE_PREFIX + name for name in _differing(one.vehicle, vehicle_of(parameters))
-            )
-            changed += [name for name in vehicle if name not in changed]
+            fixed = (VEHICLE_PREFIX + name for name in _differing(one.vehicle, vehicle))
+            changed += [name for name in fixed if name not in changed]
             labels.append(f"{one.label} (changed: {', '.join(changed)})" if changed else one.label)
         return " + ".join(labels) or NO_SET
 

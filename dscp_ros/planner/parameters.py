@@ -16,7 +16,6 @@ from dscp_core.errors import InvalidInputError
 from dscp_core.planning.certificate import ControlHold
 from dscp_core.planning.planner import PlannerSettings, TerminalTime
 from dscp_core.problem.declaration import OptimalControlProblem
-from dscp_core.problems.powered_descent.network import DEFAULT_NETWORK
 from dscp_core.scp.scp import ScpOptions
 from dscp_ros.planner.declaration import NodeParameter, Value
 from dscp_ros.planner.input_checks import InputSettings
@@ -30,8 +29,6 @@ from msg_adapters.parameters import (
 )
 
 NETWORK = "terminal_time_network"
-SHIPPED_NETWORKS = {"powered_descent": DEFAULT_NETWORK}
-"""Network of each problem's default vehicle, where there is one."""
 RELIABLE = "reliable"
 BEST_EFFORT = "best_effort"
 
@@ -64,7 +61,7 @@ class NodeSettings:
 
 PROBLEM = NodeParameter(
     "problem",
-    "powered_descent",
+    problems.DEFAULT,
     "Problem that is planned for.",
     choices=problems.names(),
     read_only=True,
@@ -99,9 +96,7 @@ def parameter_table(problem: OptimalControlProblem) -> tuple[NodeParameter, ...]
     )
 
 
-def node_settings(
-    problem: OptimalControlProblem, formulation: str, values: Mapping[str, Any]
-) -> NodeSettings:
+def node_settings(problem: OptimalControlProblem, values: Mapping[str, Any]) -> NodeSettings:
     """Settings of parameter values, each of which has passed its own check.
 
     Raises:
@@ -113,8 +108,6 @@ def node_settings(
     problem.pack(vehicle)
     return NodeSettings(
         planner=PlannerSettings(
-            problem=problem.name,
-            formulation=formulation,
             parameters=vehicle,
             intervals=values["intervals"],
             terminal_time=TerminalTime(values["terminal_time_source"]),
@@ -220,7 +213,7 @@ def _terminal_time_parameters(problem: OptimalControlProblem) -> list[NodeParame
         "then what is left of it.",
         choices=free_or_fixed,
     )
-    if problem.name not in SHIPPED_NETWORKS:
+    if problem.extras.network is None:
         return [source]
     return [
         replace(

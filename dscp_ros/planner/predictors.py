@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from dscp_core.errors import InvalidInputError
 from dscp_core.planning.planner import TerminalTimePredictor
-from dscp_core.problems.powered_descent.network import TerminalTimeNetwork
-from dscp_ros.planner.parameters import NETWORK, SHIPPED_NETWORKS
+from dscp_core.planning.terminal_time_network import TerminalTimeNetwork
+from dscp_ros.planner.parameters import NETWORK
 
 
 @dataclass(frozen=True)
@@ -56,23 +56,23 @@ class Unsuited:
 class Predictors:
     """Networks by name. Each is read once: a file that changes takes effect with a new object."""
 
-    def __init__(self, problem: str, named: NamedNetwork | None) -> None:
+    def __init__(self, shipped: Path | None, named: NamedNetwork | None) -> None:
         """Start with nothing read.
 
         Args:
-            problem: Name of the problem.
+            shipped: The network that the problem brings, if any.
             named: What the last parameter file that names a network says of it.
         """
-        self._problem = problem
+        self._shipped = shipped
         self._named = named
         self._read: dict[Path, TerminalTimeNetwork] = {}
 
-    def predictor(self, text: str, parameters: Mapping[str, Any]) -> TerminalTimePredictor:
+    def predictor(self, text: str, vehicle: Mapping[str, Any]) -> TerminalTimePredictor:
         """The predictor that a value of the parameter means.
 
         Args:
             text: Its value.
-            parameters: All parameters of the problem by name, SI, in the core's axes.
+            vehicle: What `OptimalControlProblem.vehicle_of` gives.
 
         Raises:
             InvalidInputError: There is no such file, or the network is of another vehicle.
@@ -80,11 +80,13 @@ class Predictors:
         """
         if text:
             network = self._network(text)
-            network.check_vehicle(parameters)
+            network.check_vehicle(vehicle)
             return network
-        network = self._from(SHIPPED_NETWORKS[self._problem])
+        if self._shipped is None:
+            raise InvalidInputError(NETWORK, text, "the file of a network")
+        network = self._from(self._shipped)
         try:
-            network.check_vehicle(parameters)
+            network.check_vehicle(vehicle)
         except InvalidInputError as error:
             return Unsuited(error.field, error.value, error.bound)
         return network

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from dscp_core.planning.plan import Plan, PlanOutcome, PlanStatus
 from dscp_core.planning.planner import Planner, PlannerSettings, TerminalTimePredictor
+from dscp_core.problem.declaration import OptimalControlProblem
 from msg_adapters.stamps import seconds_from_nanoseconds
 from msg_adapters.state import StampedState
 
@@ -15,11 +16,13 @@ class PlannerSetup:
     """What a planner is made of.
 
     Attributes:
-        settings: What to plan and how.
+        problem: What to plan.
+        settings: How to plan it.
         predictor: For a predicted terminal time.
         parameter_set: Names the parameter sets that all this comes from, for reports.
     """
 
+    problem: OptimalControlProblem
     settings: PlannerSettings
     predictor: TerminalTimePredictor | None
     parameter_set: str
@@ -30,7 +33,7 @@ class PlannerSetup:
         Raises:
             InvalidInputError: A setting is refused.
         """
-        return Planner(self.settings, self.predictor)
+        return Planner(self.problem, self.settings, self.predictor)
 
     def plans_like(self, other: PlannerSetup) -> bool:
         """Whether another one makes the same plans."""

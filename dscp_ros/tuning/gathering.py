@@ -17,7 +17,7 @@ from dscp_ros.tuning.sources import check_new, file_digests
 from dscp_ros.tuning.split import Split, split_by_share, split_given, thin
 
 if TYPE_CHECKING:
-    from dscp_core.problems.powered_descent.network import TerminalTimeNetwork
+    from dscp_core.planning.terminal_time_network import TerminalTimeNetwork
     from dscp_ros.tuning.start import Start
 
 OUTSIDE_ENVELOPE = "OUTSIDE_ENVELOPE"

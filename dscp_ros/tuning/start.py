@@ -9,12 +9,12 @@ from typing import Any
 
 from dscp_core.errors import InvalidInputError
 from dscp_core.planning.planner import TerminalTime
-from dscp_core.problems.powered_descent.network import TerminalTimeNetwork
+from dscp_core.planning.terminal_time_network import TerminalTimeNetwork
 from dscp_core.tuning.quantities import TunedParameter
 from dscp_ros.parameter_set.values import CheckedValues, check_values
 from dscp_ros.planner.parameter_files import ParameterArguments, check_node_names
 from dscp_ros.planner.parameter_sources import ParameterSources, read_sources
-from dscp_ros.planner.parameters import NETWORK, PROBLEM, SHIPPED_NETWORKS, problem_layout
+from dscp_ros.planner.parameters import NETWORK, PROBLEM, problem_layout
 from msg_adapters.frames import StateLayout
 
 _SOURCE = "terminal_time_source"
@@ -90,11 +90,11 @@ def read_start(
     if problem is not None and given.setdefault(PROBLEM.name, problem) != problem:
         raise InvalidInputError("--problem", problem, f"{given[PROBLEM.name]}, as in the files")
     values = check_values(given)
-    sources.check_vehicle(values.parameters)
+    sources.check_vehicle(values.vehicle)
     notes: tuple[str, ...] = ()
     source = values.planner.terminal_time
     if (network or tunes_network) and source is not TerminalTime.PREDICTED:
-        if values.problem.name not in SHIPPED_NETWORKS:
+        if values.problem.extras.network is None:
             raise InvalidInputError("network", values.problem.name, "a problem that has networks")
         values = check_values({**given, _SOURCE: TerminalTime.PREDICTED.value})
         notes = (f"{_SOURCE} is predicted, for the network; it was {source.value}",)
@@ -104,10 +104,10 @@ def read_start(
     }
     if values.planner.terminal_time is not TerminalTime.PREDICTED:
         return Start(values, None, origin, notes)
-    loaded = _network(values.problem.name, sources, network)
+    loaded = _network(values.problem.extras.network, sources, network)
     origin["network"] = str(network or values.given.get(NETWORK) or _SHIPPED)
     try:
-        loaded.check_vehicle(values.parameters)
+        loaded.check_vehicle(values.vehicle)
     except InvalidInputError as error:
         if tunes_network:
             notes = (*notes, f"the network starts from one of another vehicle: {error}")
@@ -122,11 +122,15 @@ def read_start(
     return Start(values, loaded, origin, notes)
 
 
-def _network(problem: str, sources: ParameterSources, given: Path | None) -> TerminalTimeNetwork:
+def _network(
+    shipped: Path | None, sources: ParameterSources, given: Path | None
+) -> TerminalTimeNetwork:
     """The network that was given, or the one that the node would take."""
     named = sources.network
     if given is not None:
         return TerminalTimeNetwork.load(given)
     if named is None or not named.text:
-        return TerminalTimeNetwork.load(SHIPPED_NETWORKS[problem])
+        if shipped is None:
+            raise InvalidInputError(NETWORK, None, "the file of a network")
+        return TerminalTimeNetwork.load(shipped)
     return named.network or TerminalTimeNetwork.load(named.folder / named.text)

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from dscp_core import problems
 from dscp_core.errors import InvalidInputError
 from dscp_core.gradients.differences import RunDifferences
 from dscp_core.gradients.losses import FinalStateLoss
@@ -244,7 +245,9 @@ def test_figure_of_a_sweep_without_any_plan(tmp_path: Path) -> None:
 
 @pytest.fixture(scope="module")
 def runs() -> RunDifferences:
-    planner = Planner(replace(COARSE, options=ScpOptions.for_gradients()))
+    planner = Planner(
+        problems.get("powered_descent"), replace(COARSE, options=ScpOptions.for_gradients())
+    )
     trace = planner.scp.run(planner.parameters)
     assert trace.status is ScpStatus.CONVERGED
     return RunDifferences(planner.scp, trace, FinalStateLoss("mass"))

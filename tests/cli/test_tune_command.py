@@ -17,7 +17,7 @@ from learning_support import network
 from sensor_msgs.msg import JointState
 
 from dscp_core import problems
-from dscp_core.problems.powered_descent.network import TerminalTimeNetwork, vehicle_of
+from dscp_core.planning.terminal_time_network import TerminalTimeNetwork
 from dscp_core.tuning import tuner
 from dscp_core.workers.processes import SerialEngine
 from dscp_ros.bag import BagWriter, Qos
@@ -232,7 +232,9 @@ def test_a_network_goes_into_the_set(
 ) -> None:
     table = problems.get("powered_descent").table
     start = replace(
-        network().data, vehicle=vehicle_of(table.unpack(table.pack())), interval_s=(38.0, 42.0)
+        network().data,
+        vehicle=problems.get("powered_descent").vehicle_of(table.unpack(table.pack())),
+        interval_s=(38.0, 42.0),
     )
     TerminalTimeNetwork(start).save(tmp_path / "start.safetensors")
     output = tmp_path / "set"

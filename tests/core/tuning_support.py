@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from dscp_core import problems
 from dscp_core.planning.planner import PlannerSettings, TerminalTime
-from dscp_core.problems.powered_descent.network import TerminalTimeNetwork, vehicle_of
+from dscp_core.planning.terminal_time_network import TerminalTimeNetwork
+from dscp_core.problem.declaration import OptimalControlProblem
 from dscp_core.tuning.choice import LossChoice
 from dscp_core.tuning.evaluator import TuningModel
 from dscp_core.tuning.network import trainable
@@ -62,22 +63,29 @@ def planner(mode: TerminalTime = TerminalTime.FIXED, **changes: Any) -> PlannerS
     return PlannerSettings(**given)
 
 
-def settings(output: Path, tuned: str, planned: PlannerSettings, **changes: Any) -> TuningSettings:
-    problem = problems.get(planned.problem, planned.formulation)
+def settings(
+    output: Path,
+    tuned: str,
+    planned: PlannerSettings,
+    problem: OptimalControlProblem | None = None,
+    **changes: Any,
+) -> TuningSettings:
+    problem = problem or problems.get("powered_descent")
     given = {"epochs": 3, "batch": 4, "workers": 1, **changes}
-    return TuningSettings(planned, parse_tuned(problem, tuned), output, **given)
+    return TuningSettings(problem, planned, parse_tuned(problem, tuned), output, **given)
 
 
 def untrained() -> TerminalTimeNetwork:
     """A network for the default vehicle with random weights, all of whose times are near 36 s."""
     data = network().data
-    table = problems.get("powered_descent").table
+    problem = problems.get("powered_descent")
+    table = problem.table
     return TerminalTimeNetwork(
         replace(
             data,
             weights=(*data.weights[:-1], 0.1 * data.weights[-1]),
             biases=(*data.biases[:-1], np.zeros(1)),
-            vehicle=vehicle_of(table.unpack(table.pack())),
+            vehicle=problem.vehicle_of(table.unpack(table.pack())),
         )
     )
 
@@ -90,10 +98,11 @@ def objective(
     fixed_iterations: int | None = None,
     envelope: bool = False,
     predictor: TerminalTimeNetwork | None = None,
+    problem: OptimalControlProblem | None = None,
 ) -> Objective:
-    problem = problems.get(planned.problem, planned.formulation)
+    problem = problem or problems.get("powered_descent")
     quantities = parse_tuned(problem, tuned)
-    model = TuningModel(planned, LossChoice.parse(loss), fixed_iterations, envelope)
+    model = TuningModel(problem, planned, LossChoice.parse(loss), fixed_iterations, envelope)
     return Objective(
         problem,
         SerialEngine(model),

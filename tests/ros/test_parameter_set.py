@@ -13,7 +13,7 @@ from learning_support import network as random_network
 
 from dscp_core import problems
 from dscp_core.errors import InvalidInputError
-from dscp_core.problems.powered_descent.network import TerminalTimeNetwork, vehicle_of
+from dscp_core.planning.terminal_time_network import TerminalTimeNetwork
 from dscp_ros.parameter_set import (
     NETWORK_FILE,
     PARAMETERS_FILE,
@@ -45,14 +45,15 @@ PROVENANCE = {"logs": [{"path": "a.mcap"}], "options": {"seed": 1}}
 
 
 def parameters(**changes: object) -> dict[str, Any]:
-    """All parameters of the problem, core axes, of VALUES' vehicle."""
-    return {**DEFAULTS, "final_position": [3.0, 1.0, 2.0], **changes}
+    """Those that fix the optimum, core axes, of VALUES' vehicle."""
+    values = {**DEFAULTS, "final_position": [3.0, 1.0, 2.0], **changes}
+    return dict(problems.get("powered_descent").vehicle_of(values))
 
 
 def fitting_network(seed: int = 0, **changes: object) -> TerminalTimeNetwork:
     """A network of that vehicle."""
     data = random_network(seed=seed).data
-    return TerminalTimeNetwork(replace(data, vehicle=vehicle_of(parameters(**changes))))
+    return TerminalTimeNetwork(replace(data, vehicle=parameters(**changes)))
 
 
 def saved(directory: Path) -> ParameterSet:

@@ -168,21 +168,21 @@ def test_what_a_state_sets_is_no_parameter():
 
 def test_vectors_are_given_in_the_landing_frame():
     values = defaults() | {"parameters.final_position": [1.0, 2.0, 30.0]}
-    settings = node_settings(DECLARED, FORMULATION, values)
+    settings = node_settings(DECLARED, values)
     assert settings.planner.parameters["final_position"] == [30.0, 1.0, 2.0]
     assert settings.markers.apex_m == (1.0, 2.0, 30.0)
 
 
 def test_terminal_time_source_is_a_setting():
     values = defaults() | {"terminal_time_source": "fixed"}
-    settings = node_settings(DECLARED, FORMULATION, values)
+    settings = node_settings(DECLARED, values)
     assert settings.planner.terminal_time is TerminalTime.FIXED
 
 
 @pytest.mark.parametrize("solver", ["", "simplex", "qoco,qoco", "qoco,", "qoco clarabel"])
 def test_a_solver_that_does_not_exist_is_refused(solver):
     with pytest.raises(InvalidInputError, match="solver"):
-        node_settings(DECLARED, FORMULATION, defaults() | {"solver": solver})
+        node_settings(DECLARED, defaults() | {"solver": solver})
 
 
 def test_the_shipped_file_holds_the_defaults():

@@ -20,7 +20,8 @@ from ros.planner_support import (
 
 from dscp_core.errors import InvalidInputError
 from dscp_core.planning.plan import PlanStatus
-from dscp_core.problems.powered_descent.network import TerminalTimeNetwork
+from dscp_core.planning.terminal_time_network import TerminalTimeNetwork
+from dscp_core.problems.powered_descent.definition import NETWORK
 from dscp_ros.parameter_set import ParameterSet, ParameterSetError, save
 from dscp_ros.planner.parameter_files import ParameterArguments
 
@@ -30,7 +31,7 @@ WEAK = {"parameters.thrust_max": 840000.0}
 
 
 def shipped(**changes: object) -> TerminalTimeNetwork:
-    return TerminalTimeNetwork(replace(TerminalTimeNetwork.load().data, **changes))
+    return TerminalTimeNetwork(replace(TerminalTimeNetwork.load(NETWORK).data, **changes))
 
 
 def weak_network() -> TerminalTimeNetwork:
@@ -61,7 +62,7 @@ def test_the_shipped_network_is_used_by_default_and_reported(ros):
         assert report.published
         assert report.attempt.terminal_time_source == "predicted"
         assert report.attempt.terminal_time_reason is None
-        expected = TerminalTimeNetwork.load().predict(STATE)
+        expected = TerminalTimeNetwork.load(NETWORK).predict(STATE)
         assert report.attempt.terminal_time_predicted_s == expected
         assert report.attempt.terminal_time_used_s == expected
         assert report.parameter_set == "none"

@@ -18,6 +18,7 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 
+from dscp_core import problems
 from dscp_core.planning.planner import Planner, PlannerSettings, TerminalTime
 from dscp_ros.bag import BagReader
 from dscp_ros.planner.input_checks import InputGate, InputSettings
@@ -206,7 +207,9 @@ def test_the_planner_answers_the_dispersed_bag_as_the_readme_says() -> None:
         int(k): (name, int(code)) for k, name, code in FAULT_ROW.findall(section(DISPERSED))
     }
     assert len(described) == 10
-    planner = Planner(PlannerSettings(terminal_time=TerminalTime.FREE))
+    planner = Planner(
+        problems.get("powered_descent"), PlannerSettings(terminal_time=TerminalTime.FREE)
+    )
     gate = InputGate(LAYOUT)
     answers: dict[int, tuple[str, int]] = {}
     states = [entry for entry in decoded(FOLDER / DISPERSED) if entry[0] == VEHICLE_STATE]

@@ -11,7 +11,7 @@ from learning_support import network
 from dscp_core import problems
 from dscp_core.errors import DscpError, InvalidInputError
 from dscp_core.planning.planner import TerminalTime
-from dscp_core.problems.powered_descent.network import TerminalTimeNetwork, vehicle_of
+from dscp_core.planning.terminal_time_network import TerminalTimeNetwork
 from dscp_core.tuning.quantities import parse_tuned
 from dscp_ros.parameter_set import PARAMETERS_FILE, save
 from dscp_ros.parameter_set.values import check_values
@@ -29,7 +29,12 @@ def parameter_file(folder: Path, text: str, name: str = "p.yaml") -> Path:
 
 
 def other_network(path: Path, **changes: float) -> TerminalTimeNetwork:
-    found = TerminalTimeNetwork(replace(network().data, vehicle=vehicle_of({**VALUES, **changes})))
+    found = TerminalTimeNetwork(
+        replace(
+            network().data,
+            vehicle=problems.get("powered_descent").vehicle_of({**VALUES, **changes}),
+        )
+    )
     found.save(path)
     return found
 

@@ -1,5 +1,5 @@
 """Hypersonic entry (sections 4.2 and 4.3, entry appendix of the paper)."""
 
-from dscp_core.problems.entry.definition import NAME, Formulation, entry
+from dscp_core.problems.entry.definition import FAMILY, NAME, Formulation, entry
 
-__all__ = ["NAME", "Formulation", "entry"]
+__all__ = ["FAMILY", "NAME", "Formulation", "entry"]

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from enum import Enum
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import casadi as ca
 
@@ -20,6 +20,7 @@ from dscp_core.problem.declaration import (
     Variable,
     Where,
 )
+from dscp_core.problem.extras import Extras
 from dscp_core.problems.entry.aero_table import read_aerodynamic_table
 from dscp_core.problems.entry.checks import check_parameters, check_printed, check_state
 from dscp_core.problems.entry.guess import rolled_out_guess, terminal_time_guess
@@ -38,6 +39,13 @@ from dscp_core.problems.entry.physics import (
     heat_rate,
     load_factor,
 )
+from dscp_core.problems.loading import ProblemFamily
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from dscp_core.planning.certificate import PlanCertificate
+    from dscp_core.planning.plan import Plan
 
 NAME = "entry"
 
@@ -269,6 +277,18 @@ _PRINTED_INTERVAL_S = 27.0
 _PROXIMAL_WEIGHTS = (1e-2, 1e-4)
 
 
+def _figure(
+    plan: Plan,
+    certificate: PlanCertificate,
+    parameters: Mapping[str, Any],
+    title: str | None = None,
+) -> Figure:
+    """`entry_figure`, read when it is drawn."""
+    from dscp_core.problems.entry.figure import entry_figure
+
+    return entry_figure(plan, certificate, parameters, title)
+
+
 def entry(formulation: Formulation = Formulation.QUADRATIC) -> OptimalControlProblem:
     """Smooth entry flight with a free terminal time as an optimal control problem.
 
@@ -307,15 +327,25 @@ def entry(formulation: Formulation = Formulation.QUADRATIC) -> OptimalControlPro
             Miss("miss_speed", _miss_speed, "m/s", _MISS_SPEED_M_S),
         ),
         control_states=(ALPHA, BANK),
+        formulation=Formulation.QUADRATIC.value,
+        extras=Extras(figure=_figure),
     )
     if formulation is Formulation.QUADRATIC:
         return _weighted(quadratic, *_PROXIMAL_WEIGHTS)
     printed = replace(
         quadratic,
+        formulation=Formulation.PRINTED.value,
         cost_terms=(CostTerm("linearised_cost", _linearised_cost, Where.NODE),),
         check_parameters=check_printed,
     )
     if formulation is Formulation.PRINTED:
         return _weighted(printed, *_PRINTED_WEIGHTS)
     gamma, rates = (weight / _PRINTED_INTERVAL_S for weight in _PRINTED_WEIGHTS)
-    return _weighted(replace(printed, trust_region_per_second=True), gamma, rates)
+    return _weighted(
+        replace(printed, trust_region_per_second=True, formulation=formulation.value), gamma, rates
+    )
+
+
+FAMILY = ProblemFamily(
+    tuple(f.value for f in reversed(Formulation)), lambda name: entry(Formulation(name))
+)

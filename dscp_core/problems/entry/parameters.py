@@ -64,6 +64,7 @@ _TIMES: tuple[Parameter, ...] = (
         lower=1.0,
         upper=1e4,
         source=TABLE,
+        fixes_optimum=False,
     ),
     Parameter(
         "terminal_time_max",
@@ -73,6 +74,7 @@ _TIMES: tuple[Parameter, ...] = (
         lower=1.0,
         upper=1e4,
         source=f"{TABLE}, where the row is named t_f,min again",
+        fixes_optimum=False,
     ),
 )
 

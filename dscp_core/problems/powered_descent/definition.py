@@ -9,7 +9,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from enum import Enum
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import casadi as ca
 import numpy as np
@@ -27,8 +28,16 @@ from dscp_core.problem.declaration import (
     Variable,
     Where,
 )
+from dscp_core.problem.extras import Extras
+from dscp_core.problems.loading import ProblemFamily
 from dscp_core.problems.powered_descent.guess import norm, projected_guess, raw_guess
 from dscp_core.problems.powered_descent.parameters import PARAMETERS, THRUST_PROX
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from dscp_core.planning.certificate import PlanCertificate
+    from dscp_core.planning.plan import Plan
 
 NAME = "powered_descent"
 
@@ -215,6 +224,22 @@ _MISSES = (
 )
 
 
+NETWORK = Path(__file__).parent / "terminal_time.safetensors"
+"""Terminal-time network of the default vehicle."""
+
+
+def _figure(
+    plan: Plan,
+    certificate: PlanCertificate,
+    parameters: Mapping[str, Any],
+    title: str | None = None,
+) -> Figure:
+    """`descent_figure`, read when it is drawn."""
+    from dscp_core.problems.powered_descent.figure import descent_figure
+
+    return descent_figure(plan, certificate, parameters, title)
+
+
 def powered_descent(formulation: Formulation = Formulation.CONVERGENT) -> OptimalControlProblem:
     """Fuel-optimal powered descent as an optimal control problem.
 
@@ -250,11 +275,14 @@ def powered_descent(formulation: Formulation = Formulation.CONVERGENT) -> Optima
         least_time_parameters={"fuel_weight": 0.0, "time_weight": 1000.0},
         misses=_MISSES,
         control_states=(3, 4, 5),
+        formulation=Formulation.CONVERGENT.value,
+        extras=Extras(figure=_figure, network=NETWORK),
     )
     if formulation is Formulation.CONVERGENT:
         return convergent
     return replace(
         convergent,
+        formulation=formulation.value,
         parameters=tuple(p for p in PARAMETERS if p.name != THRUST_PROX),
         initial_guess=raw_guess,
         cost_terms=(),
@@ -266,3 +294,8 @@ def powered_descent(formulation: Formulation = Formulation.CONVERGENT) -> Optima
         virtual_control_tolerance=1e-4,
         trust_region_control=(1e-3 * _MASS_KG / _COST_KG,) * 3,
     )
+
+
+FAMILY = ProblemFamily(
+    tuple(f.value for f in reversed(Formulation)), lambda name: powered_descent(Formulation(name))
+)

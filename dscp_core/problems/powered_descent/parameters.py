@@ -29,6 +29,7 @@ PARAMETERS: tuple[Parameter, ...] = (
         lower=1e-3,
         upper=600.0,
         source="chosen",
+        fixes_optimum=False,
     ),
     Parameter(
         "terminal_time_max",
@@ -38,6 +39,7 @@ PARAMETERS: tuple[Parameter, ...] = (
         lower=1e-3,
         upper=600.0,
         source="chosen",
+        fixes_optimum=False,
     ),
     Parameter(
         "initial_position",
@@ -166,6 +168,7 @@ PARAMETERS: tuple[Parameter, ...] = (
         lower=0.0,
         upper=1.0,
         source="chosen: costs at most 0.4 kg against 1, and no accuracy of gradients",
+        fixes_optimum=False,
     ),
     Parameter(
         THRUST_PROX,
@@ -175,5 +178,6 @@ PARAMETERS: tuple[Parameter, ...] = (
         "nodal alternation that the midpoint rule does not see.",
         lower=0.0,
         source="chosen",
+        fixes_optimum=False,
     ),
 )

@@ -18,7 +18,7 @@ from dscp_core.errors import DscpError, InvalidInputError
 from dscp_core.planning.plan import Plan, PlanOutcome, PlanStatus
 from dscp_core.planning.planner import Planner, PlannerSettings
 from dscp_core.problem.declaration import named
-from dscp_core.problems.powered_descent import NAME as POWERED_DESCENT
+from dscp_core.problems.powered_descent.definition import powered_descent
 from dscp_core.transcription.compiled import CompiledFunction
 
 Array = NDArray[np.float64]
@@ -174,14 +174,12 @@ def simulate_descent(
         options: How guidance runs; those of `SimulationOptions` if None.
 
     Raises:
-        InvalidInputError: Another problem than powered descent, or a refused setting.
+        InvalidInputError: A refused setting.
         NoFirstPlanError: There is no certified plan from the first measured state.
     """
-    if settings.problem != POWERED_DESCENT:
-        raise InvalidInputError("problem", settings.problem, POWERED_DESCENT)
     options = options or SimulationOptions()
     random = np.random.default_rng(seed)
-    planner = Planner(settings)
+    planner = Planner(powered_descent(), settings)
     guidance = _Guidance(planner, options)
     vehicle = _Vehicle(planner, dispersions or Dispersions(), random)
     times, states, measured = [0.0], [vehicle.initial_state], []

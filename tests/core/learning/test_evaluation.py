@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from learning_support import network
 
+from dscp_core import problems
 from dscp_core.learning.evaluation import (
     Measurement,
     check_against_ipopt,
@@ -20,7 +21,7 @@ from dscp_core.learning.labels import LabelError
 from dscp_core.learning.sampling import PAPER_BOX, horizontal_profile
 from dscp_core.workers.processes import SerialEngine
 
-MODEL = OptimumModel({"mean_thrust_fraction": 1.0}, intervals=20)
+MODEL = OptimumModel(problems.get("powered_descent"), {"mean_thrust_fraction": 1.0}, intervals=20)
 STATES = PAPER_BOX.uniform(5, np.random.default_rng(6))
 
 

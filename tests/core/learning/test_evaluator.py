@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from oracles.powered_descent_nlp import NlpOptions, solve_free_time
 
+from dscp_core import problems
 from dscp_core.learning.evaluator import (
     BestTimeJob,
     GivenTimeJob,
@@ -25,7 +26,9 @@ PATIENT = ScpOptions(max_iterations=60)
 
 @pytest.fixture(scope="module")
 def evaluator() -> OptimumEvaluator:
-    return OptimumModel({"mean_thrust_fraction": 1.0}, intervals=15)()
+    return OptimumModel(
+        problems.get("powered_descent"), {"mean_thrust_fraction": 1.0}, intervals=15
+    )()
 
 
 def test_best_times_are_those_of_an_independent_solver(evaluator: OptimumEvaluator) -> None:
@@ -51,7 +54,7 @@ def test_result_does_not_depend_on_what_was_done_before(evaluator: OptimumEvalua
 @pytest.mark.parametrize("method", [GradientMethod.ENVELOPE, GradientMethod.UNROLLED])
 def test_slopes_are_those_of_the_mass(method: GradientMethod) -> None:
     # 0.999, the planner's own: with it the unrolled derivative has a regular active set.
-    evaluator = OptimumModel(intervals=15)()
+    evaluator = OptimumModel(problems.get("powered_descent"), intervals=15)()
     options = ScpOptions.for_gradients(cost_tolerance=1e-11, max_iterations=60)
     step = 1e-3
     for time in (32.6, 33.3, 34.0):

@@ -10,7 +10,7 @@ from dscp_core.learning.gauss_newton import FitError, GaussNewton, Targets
 from dscp_core.learning.network_torch import TorchNetwork
 from dscp_core.learning.recipes import Fit
 from dscp_core.learning.sampling import PAPER_BOX
-from dscp_core.problems.powered_descent.network import FeatureMap, TerminalTimeNetwork
+from dscp_core.planning.terminal_time_network import FeatureMap, TerminalTimeNetwork
 
 STATES = PAPER_BOX.uniform(60, np.random.default_rng(0))
 

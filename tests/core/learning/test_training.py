@@ -29,7 +29,7 @@ from dscp_core.learning.run import Errors, Run, TrainingError
 from dscp_core.learning.sampling import PAPER_BOX
 from dscp_core.learning.stochastic import take_stochastic_steps
 from dscp_core.learning.training import HISTORY_FILE, NETWORK_FILE, train
-from dscp_core.problems.powered_descent.network import TerminalTimeNetwork
+from dscp_core.planning.terminal_time_network import TerminalTimeNetwork
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +47,10 @@ def test_training_learns(trained: Path) -> None:
     assert best < 1.5e-2
     assert all(entry["vertical_max"] > 0.0 for entry in history)
     table = problems.get("powered_descent").table
-    network = TerminalTimeNetwork.load(trained / NETWORK_FILE, vehicle=table.unpack(table.pack()))
+    network = TerminalTimeNetwork.load(
+        trained / NETWORK_FILE,
+        vehicle=problems.get("powered_descent").vehicle_of(table.unpack(table.pack())),
+    )
     assert network.data.intervals == 20
     assert network.data.provenance["seed"] == 1
     states = PAPER_BOX.uniform(50, np.random.default_rng(0))

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from oracles.powered_descent_nlp import Status, solve_free_time, solve_least_time
 from oracles.powered_descent_physics import PAPER_INITIAL_STATE, PAPER_PARAMETERS, state_rate
 
+from dscp_core import problems
 from dscp_core.cone.solvers import SolverSettings
 from dscp_core.errors import InvalidInputError
 from dscp_core.planning.certificate import ControlHold
@@ -22,12 +23,14 @@ START = np.array(PAPER_INITIAL_STATE)
 
 @pytest.fixture(scope="module")
 def fixed() -> Planner:
-    return Planner(PlannerSettings())
+    return Planner(problems.get("powered_descent"), PlannerSettings())
 
 
 @pytest.fixture(scope="module")
 def free() -> Planner:
-    return Planner(PlannerSettings(terminal_time=TerminalTime.FREE))
+    return Planner(
+        problems.get("powered_descent"), PlannerSettings(terminal_time=TerminalTime.FREE)
+    )
 
 
 @pytest.fixture(scope="module")
@@ -77,7 +80,10 @@ def test_plan_is_in_si_and_complete(fixed: Planner, first: Plan) -> None:
 
 def test_initial_state_of_the_settings(fixed: Planner) -> None:
     np.testing.assert_array_equal(fixed.initial_state, START)
-    other = Planner(PlannerSettings(parameters={"initial_mass": 36000.0}, intervals=5))
+    other = Planner(
+        problems.get("powered_descent"),
+        PlannerSettings(parameters={"initial_mass": 36000.0}, intervals=5),
+    )
     assert other.initial_state[6] == 36000.0
 
 
@@ -101,7 +107,9 @@ def test_random_states_of_the_box_are_certified(free: Planner) -> None:
 
 @pytest.mark.parametrize("time_s", [31.0, 31.9, 32.0, 32.04])
 def test_too_little_time_is_infeasible(time_s: float) -> None:
-    planner = Planner(PlannerSettings(parameters={"terminal_time": time_s}))
+    planner = Planner(
+        problems.get("powered_descent"), PlannerSettings(parameters={"terminal_time": time_s})
+    )
     outcome = planner.plan(planner.initial_state)
     assert outcome.status is PlanStatus.INFEASIBLE
     assert "no feasible trajectory" in outcome.message
@@ -123,7 +131,10 @@ def test_least_terminal_time(fixed: Planner, free: Planner) -> None:
 
 
 def test_no_least_time_of_a_vehicle_that_cannot_brake() -> None:
-    planner = Planner(PlannerSettings(parameters={"thrust_max": 2.0e5, "initial_mass": 60000.0}))
+    planner = Planner(
+        problems.get("powered_descent"),
+        PlannerSettings(parameters={"thrust_max": 2.0e5, "initial_mass": 60000.0}),
+    )
     assert planner.least_terminal_time(planner.initial_state) is None
 
 
@@ -140,7 +151,10 @@ def test_warm_start_continues_the_plan(fixed: Planner, first: Plan) -> None:
         assert outcome.warm_started
         # On the way, what is left of the flight time is used, not all of it again.
         assert outcome.terminal_time_used_s == pytest.approx(32.81 - elapsed_s)
-        cold = Planner(PlannerSettings(parameters={"terminal_time": 32.81 - elapsed_s}))
+        cold = Planner(
+            problems.get("powered_descent"),
+            PlannerSettings(parameters={"terminal_time": 32.81 - elapsed_s}),
+        )
         reference = cold.plan(first.states[node])
         assert outcome.iterations < reference.iterations
         # The cost tolerance of 1e-8 of 32 t.
@@ -160,7 +174,7 @@ def test_warm_start_of_a_disturbed_state(free: Planner) -> None:
 
 
 def test_warm_start_from_a_plan_with_other_nodes(fixed: Planner) -> None:
-    coarse = Planner(PlannerSettings(intervals=20))
+    coarse = Planner(problems.get("powered_descent"), PlannerSettings(intervals=20))
     outcome = fixed.plan(START, warm_start=plan_of(coarse.plan(START)))
     assert outcome.status is PlanStatus.CERTIFIED
     assert outcome.warm_started
@@ -228,7 +242,10 @@ def test_states_of_wrong_length_are_refused(fixed: Planner, state: Array) -> Non
 
 
 def test_ground_is_where_the_landing_site_is() -> None:
-    planner = Planner(PlannerSettings(parameters={"final_position": [100.0, 0.0, 0.0]}))
+    planner = Planner(
+        problems.get("powered_descent"),
+        PlannerSettings(parameters={"final_position": [100.0, 0.0, 0.0]}),
+    )
     state = START.copy()
     # The certificate's metre is allowed.
     state[0] = 98.5
@@ -262,7 +279,9 @@ def test_deadline_does_not_stay(fixed: Planner) -> None:
 
 def test_iteration_limit_is_certified_by_the_flight_only() -> None:
     # One iteration leaves the dynamics unmet; a certificate decides what such a plan is worth.
-    planner = Planner(PlannerSettings(options=ScpOptions(max_iterations=1)))
+    planner = Planner(
+        problems.get("powered_descent"), PlannerSettings(options=ScpOptions(max_iterations=1))
+    )
     outcome = planner.plan(START)
     assert outcome.iterations == 1
     assert outcome.certificate is not None
@@ -276,7 +295,7 @@ def test_iteration_limit_is_certified_by_the_flight_only() -> None:
 
 def test_converged_plan_may_fail_the_certificate() -> None:
     # Ten intervals are too coarse for the flight to end where the nodes do.
-    planner = Planner(PlannerSettings(intervals=10))
+    planner = Planner(problems.get("powered_descent"), PlannerSettings(intervals=10))
     outcome = planner.plan(START)
     assert outcome.status is PlanStatus.NOT_CERTIFIED
     assert outcome.certificate is not None
@@ -287,7 +306,7 @@ def test_converged_plan_may_fail_the_certificate() -> None:
 
 def test_solver_failure() -> None:
     options = ScpOptions(solver="clarabel", solver_settings=SolverSettings(max_iterations=2))
-    outcome = Planner(PlannerSettings(options=options)).plan(START)
+    outcome = Planner(problems.get("powered_descent"), PlannerSettings(options=options)).plan(START)
     assert outcome.status is PlanStatus.SOLVER_FAILURE
     assert outcome.plan is None
     assert "clarabel" in outcome.message
@@ -297,8 +316,6 @@ def test_solver_failure() -> None:
 @pytest.mark.parametrize(
     ("settings", "match"),
     [
-        (PlannerSettings(problem="ascent"), "problem"),
-        (PlannerSettings(formulation="exact"), "formulation"),
         (PlannerSettings(parameters={"thrust": 1.0}), "did you mean"),
         (PlannerSettings(parameters={"thrust_max": -1.0}), "thrust_max"),
         (PlannerSettings(intervals=1), "intervals"),
@@ -307,7 +324,7 @@ def test_solver_failure() -> None:
 )
 def test_bad_settings(settings: PlannerSettings, match: str) -> None:
     with pytest.raises(InvalidInputError, match=match):
-        Planner(settings)
+        Planner(problems.get("powered_descent"), settings)
 
 
 def test_status_numbers_are_stable() -> None:
@@ -324,8 +341,8 @@ def test_status_numbers_are_stable() -> None:
 
 
 def test_settings_that_suit_a_problem_are_its_own() -> None:
-    entry = PlannerSettings.suited("entry", hold=ControlHold.LINEAR)
+    entry = PlannerSettings.suited(problems.get("entry"), hold=ControlHold.LINEAR)
     assert (entry.intervals, entry.terminal_time) == (100, TerminalTime.FREE)
     assert entry.hold is ControlHold.LINEAR
-    assert PlannerSettings.suited("powered_descent") == PlannerSettings()
-    assert PlannerSettings.suited("entry", intervals=60).intervals == 60
+    assert PlannerSettings.suited(problems.get("powered_descent")) == PlannerSettings()
+    assert PlannerSettings.suited(problems.get("entry"), intervals=60).intervals == 60

@@ -7,10 +7,12 @@ import pytest
 from numpy.typing import NDArray
 from oracles.powered_descent_physics import PAPER_INITIAL_STATE
 
+from dscp_core import problems
 from dscp_core.errors import InvalidInputError
 from dscp_core.planning.plan import Plan, PlanOutcome, PlanStatus
 from dscp_core.planning.planner import Planner, PlannerSettings, TerminalTime
-from dscp_core.problems.powered_descent.network import TerminalTimeNetwork
+from dscp_core.planning.terminal_time_network import TerminalTimeNetwork
+from dscp_core.problems.powered_descent.definition import NETWORK
 
 Array = NDArray[np.float64]
 
@@ -19,7 +21,9 @@ START = np.array(PAPER_INITIAL_STATE)
 
 @pytest.fixture(scope="module")
 def free() -> Planner:
-    return Planner(PlannerSettings(terminal_time=TerminalTime.FREE))
+    return Planner(
+        problems.get("powered_descent"), PlannerSettings(terminal_time=TerminalTime.FREE)
+    )
 
 
 def plan_of(outcome: PlanOutcome) -> Plan:
@@ -43,7 +47,7 @@ class Predictor:
 def predicted() -> Planner:
     """Predicts 33.1 s for every state of 38 t."""
     settings = PlannerSettings(terminal_time=TerminalTime.PREDICTED)
-    return Planner(settings, Predictor(33.1))
+    return Planner(problems.get("powered_descent"), settings, Predictor(33.1))
 
 
 def predicting(planner: Planner, time_s: float) -> Planner:
@@ -141,8 +145,14 @@ def test_after_a_bad_prediction_the_deadline_still_counts(predicted: Planner) ->
 
 
 def test_shipped_network_is_a_predictor(free: Planner) -> None:
-    network = TerminalTimeNetwork.load(vehicle=free.problem.table.unpack(free.parameters))
-    planner = Planner(PlannerSettings(terminal_time=TerminalTime.PREDICTED), network)
+    network = TerminalTimeNetwork.load(
+        NETWORK, free.problem.vehicle_of(free.problem.table.unpack(free.parameters))
+    )
+    planner = Planner(
+        problems.get("powered_descent"),
+        PlannerSettings(terminal_time=TerminalTime.PREDICTED),
+        network,
+    )
     outcome = planner.plan(START)
     best = free.plan(START)
     assert outcome.status is PlanStatus.CERTIFIED
@@ -164,4 +174,4 @@ def test_shipped_network_is_a_predictor(free: Planner) -> None:
 )
 def test_predictor_comes_with_its_mode(mode: TerminalTime, predictor: Any) -> None:
     with pytest.raises(InvalidInputError, match="predictor"):
-        Planner(PlannerSettings(terminal_time=mode), predictor)
+        Planner(problems.get("powered_descent"), PlannerSettings(terminal_time=mode), predictor)

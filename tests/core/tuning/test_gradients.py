@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +14,7 @@ from core.whole_runs import difference
 from dscp_core import problems
 from dscp_core.planning.certificate import ControlHold, PlanVerifier
 from dscp_core.planning.planner import PlannerSettings, TerminalTime
-from dscp_core.problem.declaration import TERMINAL_TIME
+from dscp_core.problem.declaration import TERMINAL_TIME, OptimalControlProblem
 from dscp_core.scp.scp import Scp, ScpOptions
 from dscp_core.transcription.transcription import Transcription
 from dscp_core.tuning.choice import cost_is_minus_mass
@@ -35,9 +35,9 @@ FREE = PlannerSettings(intervals=12, terminal_time=TerminalTime.FREE)
 FIXED = support.planner(intervals=12)
 # A weight that leaves a virtual control to be seen; a formulation that needs a trust region.
 SOFT = support.planner(intervals=12, parameters={"virtual_control_weight": 100.0})
-PRINTED = support.planner(intervals=12, formulation="printed")
+PRINTED = problems.get("powered_descent", "printed")
 
-ENTRY = PlannerSettings(problem="entry", intervals=60, terminal_time=TerminalTime.FREE)
+ENTRY = PlannerSettings(intervals=60, terminal_time=TerminalTime.FREE)
 
 
 @dataclass(frozen=True)
@@ -55,6 +55,7 @@ class Case:
     iterations: int | None
     step: float
     tolerance: float
+    problem: OptimalControlProblem = field(default_factory=lambda: problems.get("powered_descent"))
 
 
 CASES = {
@@ -71,12 +72,14 @@ CASES = {
     ),
     "parameter user": Case("gravity=9:11", "user", FREE, 6, 1e-4, 1e-5),
     "time user": Case("terminal_time=34:38", "user", FIXED, 6, 1e-4, 1e-5),
-    "weights convergence": Case("trust_region_control", "convergence", PRINTED, 4, 1e-3, 1e-5),
+    "weights convergence": Case(
+        "trust_region_control", "convergence", FIXED, 4, 1e-3, 1e-5, PRINTED
+    ),
     "state weight convergence": Case(
-        "trust_region_state.vy@1", "convergence", PRINTED, 4, 1e-2, 1e-4
+        "trust_region_state.vy@1", "convergence", FIXED, 4, 1e-2, 1e-4, PRINTED
     ),
     "weight iterations": Case(
-        "trust_region_control.thrust_y", "iterations", PRINTED, 5, 1e-3, 1e-5
+        "trust_region_control.thrust_y", "iterations", FIXED, 5, 1e-3, 1e-5, PRINTED
     ),
     "step weight cost": Case("trust_region_step@10", "cost", FREE, 3, 1e-3, 1e-5),
     "virtual weight convergence": Case(
@@ -88,28 +91,33 @@ CASES = {
 }
 # Path constraints become active node by node: the step has to be small for no kink to be crossed.
 ENTRY_CASES = {
-    "entry parameter cost": Case("surface_to_mass_ratio=0.75:1.25", "cost", ENTRY, 5, 1e-4, 1e-4),
-    "entry parameter miss": Case("surface_to_mass_ratio=0.75:1.25", "miss", ENTRY, 5, 1e-4, 1e-4),
+    "entry parameter cost": Case(
+        "surface_to_mass_ratio=0.75:1.25", "cost", ENTRY, 5, 1e-4, 1e-4, problems.get("entry")
+    ),
+    "entry parameter miss": Case(
+        "surface_to_mass_ratio=0.75:1.25", "miss", ENTRY, 5, 1e-4, 1e-4, problems.get("entry")
+    ),
     "entry weights convergence": Case(
         "trust_region_state.flight_path_angle,trust_region_control",
         "convergence",
-        replace(ENTRY, formulation="printed"),
+        ENTRY,
         4,
         1e-4,
         1e-4,
+        problems.get("entry", "printed"),
     ),
 }
 
 
 def states_of(case: Case) -> StateSet:
-    if case.planner.problem == "entry":
+    if case.problem.name == "entry":
         problem = problems.get("entry")
         packed = problem.pack()
         names = problem.initial_state_parameters
         return support.state_set(
             np.concatenate([packed[problem.table.slice(name)] for name in names])[None, :]
         )
-    printed = case.planner.formulation == "printed"
+    printed = case.problem.formulation == "printed"
     return support.state_set(support.PRINTED_STATES if printed else support.STATES[:2])
 
 
@@ -120,7 +128,13 @@ def test_every_kind_of_quantity_and_loss(name: str, tmp_path: Path) -> None:
     if loss == "user":
         (tmp_path / "own.py").write_text(USER, encoding="utf-8")
         loss = f"{tmp_path / 'own.py'}:loss"
-    objective = support.objective(case.tuned, loss, case.planner, fixed_iterations=case.iterations)
+    objective = support.objective(
+        case.tuned,
+        loss,
+        case.planner,
+        fixed_iterations=case.iterations,
+        problem=case.problem,
+    )
     states = states_of(case)
     start = objective.space.start()
     found = objective.evaluate(start, states)
@@ -147,12 +161,13 @@ TIGHT = ScpOptions(cost_tolerance=1e-10, max_iterations=60)
         ("surface_to_mass_ratio=0.75:1.25", "cost", ENTRY),
         ("rate_weight=0.5:2", "fuel", ENTRY),
     ],
-    ids=lambda value: value if isinstance(value, str) else value.problem,
+    ids=lambda value: value if isinstance(value, str) else f"{value.intervals}",
 )
 def test_envelope(tuned: str, loss: str, planner: PlannerSettings) -> None:
     """Derivative of the optimum from multipliers alone, against differences of converged runs."""
-    case = Case(tuned, loss, replace(planner, options=TIGHT), None, 0.0, 0.0)
-    objective = support.objective(tuned, loss, case.planner, envelope=True)
+    problem = problems.get("entry" if planner is ENTRY else "powered_descent")
+    case = Case(tuned, loss, replace(planner, options=TIGHT), None, 0.0, 0.0, problem)
+    objective = support.objective(tuned, loss, case.planner, envelope=True, problem=problem)
     states = states_of(case).part(np.array([0]))
     start = objective.space.start()
     found = objective.evaluate(start, states)

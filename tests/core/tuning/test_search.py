@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from core import tuning_support as support
 
+from dscp_core import problems
 from dscp_core.files import FileWriteError
 from dscp_core.learning.checkpoint import CHECKPOINT_FILE, CheckpointError
 from dscp_core.planning.planner import PlannerSettings, TerminalTime
@@ -113,7 +114,13 @@ def test_interrupted_search_goes_on_to_the_same_result(
         settings = support.settings(
             tmp_path / folder, tuned, PREDICTED, optimiser=optimiser, epochs=3, batch=1
         )
-        store = ReferenceStore(settings.output, reference_size(PREDICTED)) if warm else None
+        store = (
+            ReferenceStore(
+                settings.output, reference_size(problems.get("powered_descent"), PREDICTED)
+            )
+            if warm
+            else None
+        )
         states = support.state_set(support.STATES[:2])
         return objective, search(objective, settings, states, store=store)
 
@@ -147,7 +154,11 @@ def test_warm_starts_save_iterations_and_end_at_the_same(tmp_path: Path) -> None
     for warm in (False, True):
         objective = support.objective(tuned, "fuel", FIXED, envelope=warm)
         settings = support.settings(tmp_path / str(warm), tuned, FIXED, epochs=4)
-        store = ReferenceStore(settings.output, reference_size(FIXED)) if warm else None
+        store = (
+            ReferenceStore(settings.output, reference_size(problems.get("powered_descent"), FIXED))
+            if warm
+            else None
+        )
         found = search(objective, settings, support.state_set(), store=store)
         found.search()
         ends.append(found.use_best())

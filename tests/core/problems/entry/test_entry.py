@@ -43,8 +43,8 @@ def printed_fine() -> Scp:
 
 @pytest.fixture(scope="module")
 def planner() -> Planner:
-    settings = PlannerSettings("entry", intervals=100, terminal_time=TerminalTime.FREE)
-    return Planner(settings)
+    settings = PlannerSettings(intervals=100, terminal_time=TerminalTime.FREE)
+    return Planner(problems.get("entry"), settings)
 
 
 def packed(scp: Scp, **values: Any) -> Array:
@@ -283,12 +283,11 @@ def test_certificate_fails_where_a_limit_is_exceeded(planner: Planner) -> None:
 
 def test_states_of_the_flight_can_be_planned_from_cold() -> None:
     settings = PlannerSettings(
-        "entry",
         intervals=60,
         terminal_time=TerminalTime.FREE,
         parameters={"terminal_time_min": 10.0},
     )
-    planner = Planner(settings)
+    planner = Planner(problems.get("entry"), settings)
     first = planner.plan(planner.initial_state)
     assert first.plan is not None
     guess = planner.problem.terminal_time_guess

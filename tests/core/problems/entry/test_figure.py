@@ -7,8 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from dscp_core import problems
 from dscp_core.errors import InvalidInputError
-from dscp_core.planning.panels import plan_figure
+from dscp_core.planning.histories import plan_figure
 from dscp_core.planning.planner import Planner, PlannerSettings, TerminalTime
 from dscp_core.problems.entry.figure import entry_figure
 
@@ -17,7 +18,7 @@ from dscp_core.problems.entry.figure import entry_figure
 def planned():
     """A plan on a coarse mesh, its certificate and its parameters."""
     planner = Planner(
-        PlannerSettings(problem="entry", intervals=60, terminal_time=TerminalTime.FREE)
+        problems.get("entry"), PlannerSettings(intervals=60, terminal_time=TerminalTime.FREE)
     )
     outcome = planner.plan(planner.initial_state)
     assert outcome.plan is not None
@@ -27,7 +28,7 @@ def planned():
 
 def test_the_figure_shows_the_flight_below_its_limits(planned, tmp_path):
     plan, certificate, parameters = planned
-    figure = plan_figure(plan, certificate, parameters)
+    figure = plan_figure(problems.get("entry"), plan, certificate, parameters)
     track, corridor, loads, climb, attack, bank = figure.axes
     flown, nodes, target = track.get_lines()
     assert np.array_equal(flown.get_xdata(), np.degrees(certificate.states[:, 1]))
@@ -49,6 +50,5 @@ def test_the_figure_shows_the_flight_below_its_limits(planned, tmp_path):
 
 def test_another_problem_is_refused(planned):
     plan, certificate, parameters = planned
-    for draw in (entry_figure, plan_figure):
-        with pytest.raises(InvalidInputError, match="problem"):
-            draw(replace(plan, problem="orbit"), certificate, parameters)
+    with pytest.raises(InvalidInputError, match="problem"):
+        entry_figure(replace(plan, problem="orbit"), certificate, parameters)

@@ -179,8 +179,3 @@ def test_bad_dispersions_are_named(value: float) -> None:
     with pytest.raises(InvalidInputError) as caught:
         Dispersions(thrust=value)
     assert caught.value.field == "thrust"
-
-
-def test_another_problem_is_refused() -> None:
-    with pytest.raises(InvalidInputError, match="powered_descent"):
-        simulate_descent(PlannerSettings(problem="entry"), seed=0)

@@ -1,4 +1,4 @@
-"""A network that predicts the optimal terminal time of powered descent (section 4.1.3).
+"""A network that predicts the optimal terminal time of a landing vehicle (section 4.1.3).
 
 Evaluated in NumPy, stored as safetensors: neither needs PyTorch.
 """
@@ -19,40 +19,14 @@ from numpy.typing import NDArray
 
 from dscp_core.errors import DscpError, InvalidInputError
 from dscp_core.files import replace_file
-from dscp_core.problem.declaration import (
-    TERMINAL_TIME,
-    TRUST_REGION_CONTROL,
-    TRUST_REGION_STATE,
-    TRUST_REGION_STEP,
-    VIRTUAL_CONTROL_WEIGHT,
-)
 
 Array = NDArray[np.float64]
 
 FORMAT = "dscp_terminal_time_network"
 VERSION = 1
-DEFAULT_NETWORK = Path(__file__).parent / "terminal_time.safetensors"
-"""Network of the default vehicle."""
 
 _STATES = ("x", "y", "z", "vx", "vy", "vz", "mass")
 _UNITS = ("m", "m", "m", "m/s", "m/s", "m/s", "kg")
-# These say where a plan starts or how it is computed, not what its optimum is.
-_NOT_OF_THE_OPTIMUM = frozenset(
-    {
-        TERMINAL_TIME,
-        "terminal_time_min",
-        "terminal_time_max",
-        "initial_position",
-        "initial_velocity",
-        "initial_mass",
-        "mean_thrust_fraction",
-        "thrust_prox",
-        TRUST_REGION_STATE,
-        TRUST_REGION_CONTROL,
-        TRUST_REGION_STEP,
-        VIRTUAL_CONTROL_WEIGHT,
-    }
-)
 
 
 class NetworkFileError(DscpError):
@@ -159,15 +133,13 @@ class TerminalTimeNetwork:
         self._middle, self._half = 0.5 * (low + high), 0.5 * (high - low)
 
     @staticmethod
-    def load(
-        path: str | Path = DEFAULT_NETWORK, vehicle: Mapping[str, Any] | None = None
-    ) -> TerminalTimeNetwork:
+    def load(path: str | Path, vehicle: Mapping[str, Any] | None = None) -> TerminalTimeNetwork:
         """Read a network.
 
         Args:
             path: Its file.
-            vehicle: Parameter values by name that it must have been trained for; not checked
-                when None.
+            vehicle: What `OptimalControlProblem.vehicle_of` gives, which it must have been trained
+                for; not checked when None.
 
         Raises:
             FileNotFoundError: There is no such file.
@@ -245,16 +217,16 @@ class TerminalTimeNetwork:
         # The sigmoid of section 4.1.3, mapped to the interval: 2 sigmoid(a) - 1 = tanh(a / 2).
         return np.asarray(self._middle + self._half * np.tanh(0.5 * logit))
 
-    def check_vehicle(self, parameters: Mapping[str, Any]) -> None:
+    def check_vehicle(self, vehicle: Mapping[str, Any]) -> None:
         """Refuse parameters that the network was not trained for.
 
         Args:
-            parameters: All parameters of the problem by name, SI.
+            vehicle: What `OptimalControlProblem.vehicle_of` gives.
 
         Raises:
             InvalidInputError: One that fixes the optimum has another value.
         """
-        given, mine = vehicle_of(parameters), self.data.vehicle
+        given, mine = vehicle, self.data.vehicle
         names = sorted(given.keys() | mine.keys())
         differing = [name for name in names if mine.get(name) != given.get(name)]
         if differing:
@@ -265,19 +237,6 @@ class TerminalTimeNetwork:
                 given.get(first),
                 f"{mine.get(first)!r}, which the terminal-time network was trained for{also}",
             )
-
-
-def vehicle_of(parameters: Mapping[str, Any]) -> dict[str, float | list[float]]:
-    """The parameters that fix the optimum from a state, as JSON holds them.
-
-    Args:
-        parameters: All parameters of the problem by name, SI.
-    """
-    return {
-        name: np.asarray(value, dtype=np.float64).tolist()
-        for name, value in parameters.items()
-        if name not in _NOT_OF_THE_OPTIMUM
-    }
 
 
 def _read(path: Path) -> NetworkData:

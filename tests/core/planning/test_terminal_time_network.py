@@ -19,11 +19,10 @@ from dscp_core import problems
 from dscp_core.errors import InvalidInputError
 from dscp_core.files import FileWriteError, replace_file
 from dscp_core.learning.sampling import PAPER_BOX
-from dscp_core.problems.powered_descent.network import (
+from dscp_core.planning.terminal_time_network import (
     FeatureMap,
     NetworkFileError,
     TerminalTimeNetwork,
-    vehicle_of,
 )
 
 STATE = np.array([5000.0, 500.0, 500.0, -150.0, 30.0, -30.0, 38000.0])
@@ -119,13 +118,12 @@ def test_another_vehicle_is_refused(tmp_path: Path) -> None:
         TerminalTimeNetwork.load(path, vehicle=other)
     with pytest.raises(InvalidInputError, match="final_position"):
         TerminalTimeNetwork.load(path, vehicle={"thrust_max": 845.2e3})
-    # Where the plan starts and how it is computed do not matter.
-    TerminalTimeNetwork.load(path, vehicle={**VEHICLE, "terminal_time": 40.0, "thrust_prox": 1e-7})
 
 
 def test_vehicle_has_what_fixes_the_optimum() -> None:
-    table = problems.get("powered_descent").table
-    names = set(vehicle_of(table.unpack(table.pack())))
+    problem = problems.get("powered_descent")
+    table = problem.table
+    names = set(problem.vehicle_of(table.unpack(table.pack())))
     assert {"thrust_min", "thrust_max", "specific_impulse", "gravity", "final_position"} <= names
     assert not names & {"initial_position", "initial_mass", "terminal_time", "trust_region_control"}
 
@@ -220,7 +218,7 @@ def test_needs_no_torch(tmp_path: Path) -> None:
     network().save(path)
     code = (
         "import sys, numpy\n"
-        "from dscp_core.problems.powered_descent.network import TerminalTimeNetwork\n"
+        "from dscp_core.planning.terminal_time_network import TerminalTimeNetwork\n"
         f"net = TerminalTimeNetwork.load({str(path)!r})\n"
         f"net.predict(numpy.array({STATE.tolist()}))\n"
         "sys.exit('torch' in sys.modules)"

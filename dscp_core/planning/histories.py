@@ -1,0 +1,141 @@
+"""The figure of any plan: histories of every state and control, with their bounds.
+
+Matplotlib is imported when it is drawn.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from dscp_core.planning.certificate import PlanCertificate
+from dscp_core.planning.panels import PLANNED, draw_history, draw_limit
+from dscp_core.planning.plan import Plan
+from dscp_core.problem.declaration import OptimalControlProblem, StagePoint, Where, named
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+Array = NDArray[np.float64]
+
+_COLUMNS = 3
+_MOST_PANELS = 24
+_PANEL_INCHES = (4.5, 3.2)
+
+
+def plan_figure(
+    problem: OptimalControlProblem,
+    plan: Plan,
+    certificate: PlanCertificate,
+    parameters: Mapping[str, Any],
+    title: str | None = None,
+) -> Figure:
+    """A plan as it was made, and as it went when it was flown.
+
+    In the figure that the problem brings, else as histories of its first states and controls, of
+    which at most 24 fit.
+
+    Args:
+        problem: What was planned.
+        plan: The plan.
+        certificate: Its certificate, with the flight.
+        parameters: Vehicle and mission by name, SI, as `ParameterTable.unpack` gives them.
+        title: Headline; by default verdict, terminal time, and what else counts.
+    """
+    brought = problem.extras.figure
+    if brought is not None:
+        return brought(plan, certificate, parameters, title)
+    from matplotlib.figure import Figure
+
+    variables = [*problem.controls, *problem.states][:_MOST_PANELS]
+    columns = min(_COLUMNS, len(variables))
+    rows = math.ceil(len(variables) / columns)
+    width, height = _PANEL_INCHES
+    figure = Figure(figsize=(columns * width, rows * height + 0.8), dpi=120, layout="constrained")
+    figure.suptitle(title or _headline(problem, plan, certificate), fontsize=13, x=0.01, ha="left")
+    bounds = box_bounds(problem, parameters)
+    planned = np.hstack([plan.controls, plan.states])
+    flown = np.hstack([certificate.controls, certificate.states])
+    pinned = _pinned(problem, parameters)
+    for number, variable in enumerate(variables):
+        axes = figure.add_subplot(rows, columns, number + 1)
+        unit = f" [{variable.unit}]" if variable.unit not in ("", "1") else ""
+        draw_history(
+            axes,
+            plan,
+            certificate,
+            planned[:, number],
+            flown[:, number],
+            f"{variable.name.replace('_', ' ')}{unit}",
+            stepped=number < len(problem.controls),
+        )
+        if variable.name in pinned:
+            axes.plot(
+                plan.terminal_time_s, pinned[variable.name], "x", color=PLANNED, clip_on=False
+            )
+        low, high = bounds.get(variable.name, (-math.inf, math.inf))
+        if math.isfinite(low):
+            draw_limit(axes, low, "least", above=False)
+        if math.isfinite(high):
+            draw_limit(axes, high, "greatest", above=True)
+    handles, labels = figure.axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="upper right", ncols=2, frameon=False)
+    return figure
+
+
+def box_bounds(
+    problem: OptimalControlProblem, parameters: Mapping[str, Any]
+) -> dict[str, tuple[float, float]]:
+    """Least and greatest value of every state and control that a constraint at the nodes bounds.
+
+    Found in the declaration: a path constraint that is affine in one variable alone.
+
+    Args:
+        problem: The declaration.
+        parameters: Every parameter by name, SI.
+    """
+    names = [v.name for v in (*problem.states, *problem.controls)]
+    nx = len(problem.states)
+    at = ca.SX.sym("at", len(names))
+    packed = ca.SX.sym("p", problem.table.size)
+    point = StagePoint(at[:nx], at[nx:], ca.SX(0.0))
+    values = problem.table.pack({n: parameters[n] for n in problem.table.names})
+    bounds = dict.fromkeys(names, (-math.inf, math.inf))
+    for constraint in problem.path_constraints:
+        if constraint.where is not Where.NODE:
+            continue
+        expression = constraint.expression(point, named(problem, packed))
+        slopes = ca.jacobian(expression, at)
+        touched = set(slopes.sparsity().get_triplet()[1])
+        if len(touched) != 1 or ca.depends_on(slopes, at):
+            continue
+        (index,) = touched
+        both = ca.Function("box", [at, packed], [expression, slopes[index]])
+        offset, slope = (float(v) for v in both(np.zeros(len(names)), values))
+        if slope == 0.0:
+            continue
+        low, high = bounds[names[index]]
+        edge = -offset / slope
+        bounds[names[index]] = (low, min(high, edge)) if slope > 0.0 else (max(low, edge), high)
+    return bounds
+
+
+def _pinned(problem: OptimalControlProblem, parameters: Mapping[str, Any]) -> dict[str, float]:
+    """Final values of the states that have one."""
+    values = {name: ca.SX(value) for name, value in parameters.items()}
+    return {name: float(value(values)) for name, value in problem.final_state.items()}
+
+
+def _headline(problem: OptimalControlProblem, plan: Plan, certificate: PlanCertificate) -> str:
+    verdict = "certified" if certificate.passed else "NOT certified"
+    text = f"{problem.name.replace('_', ' ')}, {verdict}: {plan.terminal_time_s:.4g} s"
+    missed = {miss.name for miss in problem.misses}
+    for check in certificate.checks:
+        if check.name in missed:
+            text += f", {check.name.replace('_', ' ')} {check.worst_value:.3g} {check.unit}"
+    return text

@@ -1,0 +1,53 @@
+"""What a problem may bring along beside its mathematics, from its own folder; all of it optional.
+
+What a problem does not bring has a generic form: a figure of every state and control, a terminal
+time that is free or given, named scalars in messages, no markers.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from matplotlib.figure import Figure
+
+    from dscp_core.planning.certificate import PlanCertificate
+    from dscp_core.planning.plan import Plan
+
+
+class PlanFigure(Protocol):
+    """Draws a plan as it was made, and as it went when it was flown."""
+
+    def __call__(
+        self,
+        plan: Plan,
+        certificate: PlanCertificate,
+        parameters: Mapping[str, Any],
+        title: str | None = None,
+    ) -> Figure:
+        """The figure.
+
+        Args:
+            plan: The plan.
+            certificate: Its certificate, with the flight.
+            parameters: Vehicle and mission by name, SI, as `ParameterTable.unpack` gives them.
+            title: Headline; None for one of its own.
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class Extras:
+    """What one problem brings.
+
+    Attributes:
+        figure: Its own figure of a plan.
+        network: File of the terminal-time network of the default vehicle.
+    """
+
+    figure: PlanFigure | None = None
+    network: Path | None = None
