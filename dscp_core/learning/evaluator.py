@@ -216,7 +216,7 @@ class OptimumEvaluator:
         if trace.failed is not None or not trace.iterations:
             return
         last = trace.iterations[-1]
-        virtual = np.max(np.abs(last.virtual_control) / layout.state_scale)
+        virtual = layout.relative(last.virtual_control)
         reached = virtual <= scp.virtual_control_tolerance
         done = trace.status in (ScpStatus.CONVERGED, ScpStatus.FIXED_ITERATIONS)
         outcome.converged[row] = done and reached

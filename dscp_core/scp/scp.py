@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import time
 from dataclasses import dataclass, field, replace
-from enum import Enum
 from typing import Any
 
 import numpy as np
@@ -15,6 +14,7 @@ from dscp_core.cone.derivative.sensitivity import KktSystem
 from dscp_core.cone.program import ConePattern, ConeSolution, ConeValues, SolveStatus
 from dscp_core.cone.solvers import SolverSettings, make_solver
 from dscp_core.errors import InvalidInputError
+from dscp_core.scp.stopping import StoppingRule, StoppingTest
 from dscp_core.scp.trace import Iteration, ScpResult, ScpStatus
 from dscp_core.transcription.transcription import Evaluation, Transcription
 
@@ -33,23 +33,6 @@ Array = NDArray[np.float64]
 DEFAULT_SOLVER = "clarabel"
 GRADIENT_TOLERANCE = 1e-12
 """Interior-point tolerance at which weakly active constraints are told from inactive ones."""
-
-
-_SETTLED_ITERATIONS = 3
-_SETTLED_CHANGE = 1e-3
-_SETTLED_DEFECT = 0.05  # of the virtual control
-
-
-class StoppingRule(Enum):
-    """When the iterations have converged.
-
-    GUARDED: the change of the cost, the change that the subproblem predicted, and the defects are
-    all small. COST_CHANGE: the paper's rule for reproduction, the change of the true cost alone,
-    which may be small for one iteration on the way, at a trajectory that cannot be flown.
-    """
-
-    GUARDED = "guarded"
-    COST_CHANGE = "cost_change"
 
 
 @dataclass(frozen=True)
@@ -177,7 +160,6 @@ class _Run:
         self._start = time.perf_counter()
         self._scp = scp
         self._options = scp.options
-        self._virtual_tolerance = scp.virtual_control_tolerance
         self._transcription = scp.transcription
         self._parameters = np.array(parameters, dtype=np.float64)
         self._warm = initial_reference is not None
@@ -194,6 +176,16 @@ class _Run:
         if not np.all(np.isfinite(self._initial)):
             what = "initial_reference" if self._warm else "the problem's initial guess"
             raise InvalidInputError(what, "NaN or Inf", "finite")
+        problem = self._transcription.problem
+        self._test = StoppingTest(
+            rule=self._options.stopping,
+            layout=self._transcription.layout,
+            cost_tolerance=scp.cost_tolerance,
+            defect_tolerance=scp.defect_tolerance,
+            virtual_control_tolerance=scp.virtual_control_tolerance,
+            least_cost=(problem.cost_magnitude or problem.cost_scale) / problem.cost_scale,
+            warm=self._warm,
+        )
         self._iterations: list[Iteration] = []
         self._first_cost = math.nan
 
@@ -214,9 +206,9 @@ class _Run:
             self._iterations.append(iteration)
             reference = iteration.solution.z[: reference.size]
             if self._options.fixed_iterations is None:
-                if self._stationary():
+                if self._test.stationary(self._iterations, self._first_cost):
                     return self._converged()
-                if self._virtual_control_settled():
+                if self._test.infeasible(self._iterations):
                     return self._finish(ScpStatus.INFEASIBLE, self._progress())
         if self._options.fixed_iterations is not None:
             return self._finish(ScpStatus.FIXED_ITERATIONS, f"{len(self._iterations)} done")
@@ -268,64 +260,21 @@ class _Run:
         start = np.concatenate([reference, layout.virtual_part(before.defects)])
         return objective(pattern, values, z) - objective(pattern, values, start)
 
-    def _stationary(self) -> bool:
-        """Whether the last iteration changed nothing that matters, feasible or not."""
-        if self._options.stopping is StoppingRule.COST_CHANGE:
-            return self._cost_stands_still()
-        last, tolerance = self._iterations[-1], self._scp.cost_tolerance
-        if len(self._iterations) < 2 and not self._warm:
-            return False
-        problem = self._transcription.problem
-        least = (problem.cost_magnitude or problem.cost_scale) / problem.cost_scale
-        scale = max(least, abs(last.penalised_cost))
-        if abs(last.predicted_change) > tolerance * scale:
-            return False
-        if len(self._iterations) > 1:
-            change = last.penalised_cost - self._iterations[-2].penalised_cost
-            if abs(change) > tolerance * scale:
-                return False
-        residual = self._relative(last.defects - last.virtual_control)
-        return residual <= self._scp.defect_tolerance
-
-    def _cost_stands_still(self) -> bool:
-        """The paper's rule: relative change of the true cost from reference to solution."""
-        iterations = self._iterations
-        before = iterations[-2].cost if len(iterations) > 1 else self._first_cost
-        return abs(iterations[-1].cost - before) < self._scp.cost_tolerance * abs(before)
-
-    def _virtual_control_settled(self) -> bool:
-        """Whether the virtual control has stopped at a size that is no rounding.
-
-        Where no trajectory is feasible, the penalty dwarfs the cost and the solver's noise in it
-        hides convergence from the tests of the cost.
-        """
-        last = self._iterations[-1]
-        sizes = [self._relative(i.virtual_control) for i in self._iterations[-_SETTLED_ITERATIONS:]]
-        return (
-            len(sizes) == _SETTLED_ITERATIONS
-            and self._relative(last.defects - last.virtual_control) <= _SETTLED_DEFECT * min(sizes)
-            and min(sizes) > self._virtual_tolerance
-            and max(sizes) - min(sizes) <= _SETTLED_CHANGE * max(sizes)
-        )
-
-    def _relative(self, residual: Array) -> float:
-        return float(np.max(np.abs(residual) / self._transcription.layout.state_scale))
-
     def _converged(self) -> ScpResult:
         last = self._iterations[-1]
-        virtual = self._relative(last.virtual_control)
-        if virtual > self._virtual_tolerance:
+        virtual = self._transcription.layout.relative(last.virtual_control)
+        if virtual > self._test.virtual_control_tolerance:
             return self._finish(ScpStatus.INFEASIBLE, self._progress())
         return self._finish(ScpStatus.CONVERGED, self._progress())
 
     def _progress(self) -> str:
         if not self._iterations:
             return "no iteration done"
-        last = self._iterations[-1]
+        last, layout = self._iterations[-1], self._transcription.layout
         return (
             f"{len(self._iterations)} iterations, predicted change {last.predicted_change:.1e}, "
-            f"defect {self._relative(last.defects):.1e}, "
-            f"virtual control {self._relative(last.virtual_control):.1e} (scaled)"
+            f"defect {layout.relative(last.defects):.1e}, "
+            f"virtual control {layout.relative(last.virtual_control):.1e} (scaled)"
         )
 
     def _failure(self, solution: ConeSolution, reference: Array) -> ScpResult:
@@ -357,8 +306,8 @@ class _Run:
                 return ScpStatus.SUBPROBLEM_INFEASIBLE, "infeasible even with free virtual control"
             return ScpStatus.SUBPROBLEM_INFEASIBLE, "infeasible whatever the cost"
         if least.status is SolveStatus.SOLVED:
-            size = self._relative(layout.virtual_control(least.z))
-            if size > self._virtual_tolerance:
+            size = self._transcription.layout.relative(layout.virtual_control(least.z))
+            if size > self._test.virtual_control_tolerance:
                 found = f"the subproblem needs a virtual control of {size:.1e} (scaled)"
                 return ScpStatus.INFEASIBLE, found
         return ScpStatus.SOLVER_FAILURE, "not infeasible as far as can be told"

@@ -105,7 +105,7 @@ class EntryRuns:
 
     def largest_defect(self, iteration: Iteration) -> float:
         """Largest residual of the discrete dynamics, relative to the states' scales."""
-        return float(np.max(np.abs(iteration.defects / self.transcription.layout.state_scale)))
+        return self.transcription.layout.relative(iteration.defects)
 
     def iterations_needed(self, trace: ScpResult, *, flyable: bool) -> int | None:
         """How many iterations of a longer run the paper's rule would have done.

@@ -107,3 +107,7 @@ class TrajectoryLayout:
         if not self.free_terminal_time:
             return np.asarray(nodes)
         return np.concatenate([[terminal_time / self.time_scale], nodes])
+
+    def relative(self, residual: Array) -> float:
+        """Largest entry of (..., nx) in size, relative to the states' scales."""
+        return float(np.max(np.abs(residual) / self.state_scale))

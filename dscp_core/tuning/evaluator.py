@@ -282,8 +282,7 @@ class StateEvaluator:
         return trace.succeeded and self._virtual_control(trace) <= scp.virtual_control_tolerance
 
     def _virtual_control(self, trace: ScpResult) -> float:
-        virtual = trace.iterations[-1].virtual_control / self._transcription.layout.state_scale
-        return float(np.max(np.abs(virtual)))
+        return self._transcription.layout.relative(trace.iterations[-1].virtual_control)
 
     def _has_loss(self, scp: Scp, trace: ScpResult) -> bool:
         """Whether the loss means something: of the path also where it did not arrive."""
