@@ -14,7 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dscp_core.planning.certificate import PlanCertificate
-from dscp_core.planning.panels import PLANNED, draw_history, draw_limit
+from dscp_core.planning.panels import (
+    PLANNED,
+    add_legend,
+    draw_history,
+    draw_limit,
+    new_figure,
+    verdict,
+)
 from dscp_core.planning.plan import Plan
 from dscp_core.problem.declaration import OptimalControlProblem, StagePoint, Where, named
 
@@ -50,14 +57,13 @@ def plan_figure(
     brought = problem.extras.figure
     if brought is not None:
         return brought(plan, certificate, parameters, title)
-    from matplotlib.figure import Figure
-
     variables = [*problem.controls, *problem.states][:_MOST_PANELS]
     columns = min(_COLUMNS, len(variables))
     rows = math.ceil(len(variables) / columns)
     width, height = _PANEL_INCHES
-    figure = Figure(figsize=(columns * width, rows * height + 0.8), dpi=120, layout="constrained")
-    figure.suptitle(title or _headline(problem, plan, certificate), fontsize=13, x=0.01, ha="left")
+    figure = new_figure(
+        (columns * width, rows * height + 0.8), title or _headline(problem, plan, certificate)
+    )
     bounds = box_bounds(problem, parameters)
     planned = np.hstack([plan.controls, plan.states])
     flown = np.hstack([certificate.controls, certificate.states])
@@ -83,8 +89,7 @@ def plan_figure(
             draw_limit(axes, low, "least", above=False)
         if math.isfinite(high):
             draw_limit(axes, high, "greatest", above=True)
-    handles, labels = figure.axes[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="upper right", ncols=2, frameon=False)
+    add_legend(figure, figure.axes[0])
     return figure
 
 
@@ -132,8 +137,7 @@ def _pinned(problem: OptimalControlProblem, parameters: Mapping[str, Any]) -> di
 
 
 def _headline(problem: OptimalControlProblem, plan: Plan, certificate: PlanCertificate) -> str:
-    verdict = "certified" if certificate.passed else "NOT certified"
-    text = f"{problem.name.replace('_', ' ')}, {verdict}: {plan.terminal_time_s:.4g} s"
+    text = f"{problem.name.replace('_', ' ')}, {verdict(certificate)}: {plan.terminal_time_s:.4g} s"
     missed = {miss.name for miss in problem.misses}
     for check in certificate.checks:
         if check.name in missed:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,12 +12,41 @@ from dscp_core.planning.plan import Plan
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 Array = NDArray[np.float64]
 
 PLANNED = "#c2410c"
 FLOWN = "#1d4ed8"
 LIMIT = "#6b7280"
+
+FLOWN_STYLE: dict[str, Any] = {"color": FLOWN, "linewidth": 1.6}
+PLANNED_STYLE: dict[str, Any] = {
+    "color": PLANNED,
+    "linestyle": "",
+    "marker": ".",
+    "markersize": 5,
+}
+
+
+def new_figure(size_inches: tuple[float, float], headline: str) -> Figure:
+    """An empty figure under a headline."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=size_inches, dpi=120, layout="constrained")
+    figure.suptitle(headline, fontsize=13, x=0.01, ha="left")
+    return figure
+
+
+def add_legend(figure: Figure, axes: Axes) -> None:
+    """The legend of one history, for all."""
+    handles, labels = axes.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="upper right", ncols=2, frameon=False)
+
+
+def verdict(certificate: PlanCertificate) -> str:
+    """What a headline says of the certificate."""
+    return "certified" if certificate.passed else "NOT certified"
 
 
 def draw_panel_style(axes: Axes) -> None:
@@ -39,10 +68,8 @@ def draw_history(
 ) -> None:
     """A panel of one quantity over time: planned at the nodes, and as flown."""
     style = "steps-post" if stepped else "default"
-    axes.plot(
-        certificate.times_s, flown, color=FLOWN, linewidth=1.6, drawstyle=style, label="integrated"
-    )
-    axes.plot(plan.times_s, planned, ".", color=PLANNED, markersize=5, label="planned (nodes)")
+    axes.plot(certificate.times_s, flown, drawstyle=style, label="integrated", **FLOWN_STYLE)
+    axes.plot(plan.times_s, planned, label="planned (nodes)", **PLANNED_STYLE)
     axes.set_xlabel("time [s]")
     axes.set_title(label, fontsize=11, loc="left")
     axes.set_xlim(0.0, plan.terminal_time_s)

@@ -5,9 +5,8 @@ from __future__ import annotations
 import os
 import zlib
 from collections.abc import Mapping
+from contextlib import AbstractContextManager
 from pathlib import Path
-from types import TracebackType
-from typing import Self
 
 from dscp_ros.bag.errors import BagFormatError, BagNotFoundError
 from dscp_ros.bag.mcap_index import (
@@ -28,7 +27,7 @@ _LATEST_TIME_NS = 2**63 - 1
 _BAG_SUFFIXES_NOT_READ = {".db3": "an SQLite bag", ".bag": "a ROS 1 bag", ".zstd": "compressed"}
 
 
-class McapFile:
+class McapFile(AbstractContextManager["McapFile"]):
     """An open MCAP file.
 
     Args:
@@ -62,15 +61,7 @@ class McapFile:
             self._handle.close()
             raise
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        error_type: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def close(self) -> None:

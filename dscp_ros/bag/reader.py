@@ -5,9 +5,9 @@ from __future__ import annotations
 import heapq
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import AbstractContextManager
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 from dscp_core.errors import InvalidInputError
 from dscp_ros.bag.errors import (
@@ -23,7 +23,7 @@ from dscp_ros.bag.recovery import Damage, DamageKind, RecoveryReport
 from dscp_ros.bag.topics import BagMessage, TopicInfo, merge_topics, topics_of
 
 
-class BagReader:
+class BagReader(AbstractContextManager["BagReader"]):
     """Reads a bag: a directory, with or without metadata.yaml, or a single MCAP file.
 
     Damage is skipped and reported (`report`), unless `strict` is set. At any time, memory holds the
@@ -62,15 +62,7 @@ class BagReader:
             self.close()
             raise
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        error_type: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def close(self) -> None:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Self, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
@@ -49,7 +50,7 @@ class _Topic:
         self.message_count = 0
 
 
-class BagWriter:
+class BagWriter(AbstractContextManager["BagWriter"]):
     """Writes one bag; use it as a context manager.
 
     Everything is written under a temporary name beside the bag (`partial_path`) and renamed when
@@ -110,9 +111,6 @@ class BagWriter:
             enable_data_crcs=True,
         )
         self._guarded(lambda: self._mcap.start(profile=_PROFILE))
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(
         self,

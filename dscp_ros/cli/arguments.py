@@ -1,4 +1,4 @@
-"""What commands share: options that describe a case or a study, and strict JSON."""
+"""What commands share: options that describe a case, and strict JSON."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from enum import Enum
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from dscp_core.errors import InvalidInputError
+from dscp_ros.cli.options import add_values
 
 if TYPE_CHECKING:
     from dscp_core.planning.planner import Planner
@@ -28,20 +28,7 @@ def add_case_arguments(parser: argparse.ArgumentParser) -> None:
         "problem", metavar="PROBLEM", help="what to solve: powered_descent or entry"
     )
     group = parser.add_argument_group("case")
-    group.add_argument(
-        "--set",
-        action="append",
-        default=[],
-        dest="assignments",
-        metavar="NAME=VALUE",
-        help="set a parameter in SI units, a vector as a,b,c; may be repeated",
-    )
-    group.add_argument(
-        "--vehicle",
-        type=Path,
-        metavar="FILE",
-        help="YAML file of parameter names and SI values; --set wins over it",
-    )
+    add_values(group)
     group.add_argument(
         "--list-parameters",
         action="store_true",
@@ -71,24 +58,6 @@ def add_case_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="NAME[,NAME]",
         help="clarabel (default), qoco, ecos, or several to try in this order",
     )
-
-
-def add_study_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declares where a study computes, and where its results go."""
-    parser.add_argument(
-        "--jobs", type=int, metavar="N", help="how many at once (default: one per processor)"
-    )
-    parser.add_argument(
-        "--ray", metavar="ADDRESS", help="compute on the Ray cluster with this head, HOST:PORT"
-    )
-    parser.add_argument(
-        "--output",
-        type=Path,
-        default=Path("out/study"),
-        metavar="DIR",
-        help="where the files go (default %(default)s)",
-    )
-    parser.add_argument("--json", action="store_true", help="print the summary as JSON on stdout")
 
 
 def overrides(

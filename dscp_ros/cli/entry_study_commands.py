@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 from dscp_core.errors import InvalidInputError
 from dscp_ros.cli import ExitCode
-from dscp_ros.cli.arguments import add_study_arguments, print_json, print_table
+from dscp_ros.cli.arguments import print_json, print_table
+from dscp_ros.cli.options import add_computing, add_folder, add_json
 from dscp_ros.cli.output_files import complete_file, write_csv
 
 if TYPE_CHECKING:
@@ -80,7 +81,9 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--restart", action="store_true", help="forget the results of an earlier run"
     )
-    add_study_arguments(parser)
+    add_computing(parser, "--jobs")
+    add_folder(parser, "out/study")
+    add_json(parser, "summary")
 
 
 def run_trust_region(args: argparse.Namespace) -> int:

@@ -13,6 +13,7 @@ from tqdm import tqdm
 from dscp_core.errors import InvalidInputError
 from dscp_ros.cli import ExitCode
 from dscp_ros.cli.arguments import overrides, print_json, print_table
+from dscp_ros.cli.options import add_computing, add_json, add_values
 
 if TYPE_CHECKING:
     from dscp_core.learning.evaluation import Measurement
@@ -91,28 +92,13 @@ def _add_terminal_time(parts: argparse._SubParsersAction[argparse.ArgumentParser
     parser.add_argument(
         "--seed", type=int, default=1, metavar="N", help="of the random states (default 1)"
     )
-    parser.add_argument(
-        "--workers", type=int, metavar="N", help="how many at once (default: one per processor)"
-    )
-    parser.add_argument(
-        "--ray", metavar="ADDRESS", help="compute on the Ray cluster with this head, HOST:PORT"
-    )
+    add_computing(parser)
     parser.add_argument(
         "--output", type=Path, metavar="DIR", help="draw the two profiles into this directory"
     )
-    parser.add_argument("--json", action="store_true", help="print the result as JSON on stdout")
-    group = parser.add_argument_group("vehicle")
-    group.add_argument(
-        "--set",
-        action="append",
-        default=[],
-        dest="assignments",
-        metavar="NAME=VALUE",
-        help="set a parameter in SI units; the network must have been trained for it",
-    )
-    group.add_argument(
-        "--vehicle", type=Path, metavar="FILE", help="YAML file of parameter names and SI values"
-    )
+    add_json(parser)
+    group = parser.add_argument_group("vehicle", "the one that the network was trained for")
+    add_values(group)
     parser.set_defaults(run=run_terminal_time)
 
 

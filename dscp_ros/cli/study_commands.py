@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 
 from dscp_core.errors import InvalidInputError
 from dscp_ros.cli import ExitCode, entry_study_commands
-from dscp_ros.cli.arguments import add_study_arguments, print_json, print_table
+from dscp_ros.cli.arguments import print_json, print_table
+from dscp_ros.cli.options import add_computing, add_folder, add_json
 from dscp_ros.cli.output_files import complete_file, write_csv
 
 if TYPE_CHECKING:
@@ -80,7 +81,9 @@ def _add_terminal_time(studies: argparse._SubParsersAction[argparse.ArgumentPars
     parser.add_argument(
         "--quick", action="store_true", help=f"fewer points: a step of {QUICK_STEP_S:g} s"
     )
-    add_study_arguments(parser)
+    add_computing(parser, "--jobs")
+    add_folder(parser, "out/study")
+    add_json(parser, "summary")
     parser.set_defaults(run=run_terminal_time)
 
 

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 
 from dscp_core.errors import InvalidInputError
 from dscp_ros.cli import ExitCode
 from dscp_ros.cli.arguments import overrides, print_json
+from dscp_ros.cli.options import add_computing, add_folder, add_json, add_values
 
 DESCRIPTION = "Trains a part of the planner."
 
@@ -55,13 +55,7 @@ def _add_terminal_time(parts: argparse._SubParsersAction[argparse.ArgumentParser
         description=TERMINAL_TIME_DESCRIPTION,
         epilog=TERMINAL_TIME_EPILOG,
     )
-    parser.add_argument(
-        "--output",
-        type=Path,
-        default=Path("out/training"),
-        metavar="DIR",
-        help="where the files go (default %(default)s)",
-    )
+    add_folder(parser, "out/training")
     parser.add_argument(
         "--resume", action="store_true", help="go on from the checkpoint in the directory"
     )
@@ -78,28 +72,10 @@ def _add_terminal_time(parts: argparse._SubParsersAction[argparse.ArgumentParser
     parser.add_argument(
         "--seed", type=int, default=0, metavar="N", help="of everything random (default 0)"
     )
-    parser.add_argument(
-        "--workers", type=int, metavar="N", help="how many at once (default: one per processor)"
-    )
-    parser.add_argument(
-        "--ray", metavar="ADDRESS", help="compute on the Ray cluster with this head, HOST:PORT"
-    )
-    parser.add_argument("--json", action="store_true", help="print the result as JSON on stdout")
+    add_computing(parser)
+    add_json(parser)
     group = parser.add_argument_group("vehicle")
-    group.add_argument(
-        "--set",
-        action="append",
-        default=[],
-        dest="assignments",
-        metavar="NAME=VALUE",
-        help="set a parameter in SI units, a vector as a,b,c; may be repeated",
-    )
-    group.add_argument(
-        "--vehicle",
-        type=Path,
-        metavar="FILE",
-        help="YAML file of parameter names and SI values; --set wins over it",
-    )
+    add_values(group)
     group.add_argument(
         "--intervals",
         type=int,

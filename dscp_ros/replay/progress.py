@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import sys
-from types import TracebackType
-from typing import Self
+from contextlib import AbstractContextManager
 
 from tqdm import tqdm
 
 _FORMAT = "{desc}{percentage:3.0f}% |{bar}| {n:.1f}/{total:.1f} s{postfix}"
 
 
-class Progress:
+class Progress(AbstractContextManager["Progress"]):
     """A bar of bag time on stderr; does nothing when it is not shown.
 
     Args:
@@ -31,15 +30,7 @@ class Progress:
             mininterval=0.0,  # the caller chooses when to draw
         )
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        error_type: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._bar.close()
 
     def show(self, played_s: float, published: int, passes: int, *, paused: bool) -> None:

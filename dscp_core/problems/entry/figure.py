@@ -13,11 +13,16 @@ from dscp_core.errors import InvalidInputError
 from dscp_core.planning.certificate import PlanCertificate
 from dscp_core.planning.panels import (
     FLOWN,
+    FLOWN_STYLE,
     LIMIT,
     PLANNED,
+    PLANNED_STYLE,
+    add_legend,
     draw_history,
     draw_limit,
     draw_panel_style,
+    new_figure,
+    verdict,
 )
 from dscp_core.planning.plan import Plan
 from dscp_core.problems.entry.physics import (
@@ -66,10 +71,7 @@ def entry_figure(
     """
     if plan.problem != "entry":
         raise InvalidInputError("problem", plan.problem, "entry")
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(13.5, 8.0), dpi=120, layout="constrained")
-    figure.suptitle(title or _headline(plan, certificate), fontsize=13, x=0.01, ha="left")
+    figure = new_figure((13.5, 8.0), title or _headline(plan, certificate))
     panels = figure.subplots(2, 3)
     _draw_track(panels[0, 0], plan, certificate, parameters)
     _draw_corridor(panels[0, 1], plan, certificate, parameters)
@@ -85,15 +87,13 @@ def entry_figure(
         for end, above in (("min", False), ("max", True)):
             limit = float(np.degrees(parameters[f"{name}_{end}"]))
             draw_limit(axes, limit, "limit", above=above)
-    handles, labels = panels[1, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="upper right", ncols=2, frameon=False)
+    add_legend(figure, panels[1, 0])
     return figure
 
 
 def _headline(plan: Plan, certificate: PlanCertificate) -> str:
     missed = {c.name: c.worst_value for c in certificate.checks}.get("miss_position")
-    verdict = "certified" if certificate.passed else "NOT certified"
-    text = f"Entry, {verdict}: {plan.terminal_time_s:.1f} s, "
+    text = f"Entry, {verdict(certificate)}: {plan.terminal_time_s:.1f} s, "
     text += f"{plan.states[-1, SPEED]:.0f} m/s at the end"
     return text if missed is None else f"{text}, miss {missed:.0f} m"
 
@@ -102,9 +102,7 @@ def _draw_track(
     axes: Axes, plan: Plan, certificate: PlanCertificate, parameters: Mapping[str, Any]
 ) -> None:
     """Ground track and target, in degrees."""
-    flown: dict[str, Any] = {"color": FLOWN, "linewidth": 1.6}
-    planned: dict[str, Any] = {"color": PLANNED, "linestyle": "", "marker": ".", "markersize": 5}
-    for states, style in ((certificate.states, flown), (plan.states, planned)):
+    for states, style in ((certificate.states, FLOWN_STYLE), (plan.states, PLANNED_STYLE)):
         longitude, latitude = np.degrees(states[:, [LONGITUDE, LATITUDE]]).T
         axes.plot(longitude, latitude, **style)
     target = float(np.degrees(parameters["final_latitude"]))

@@ -11,11 +11,16 @@ from numpy.typing import NDArray
 from dscp_core.planning.certificate import PlanCertificate
 from dscp_core.planning.panels import (
     FLOWN,
+    FLOWN_STYLE,
     LIMIT,
     PLANNED,
+    PLANNED_STYLE,
+    add_legend,
     draw_history,
     draw_limit,
     draw_panel_style,
+    new_figure,
+    verdict,
 )
 from dscp_core.planning.plan import Plan
 
@@ -40,10 +45,7 @@ def descent_figure(
         parameters: Vehicle and mission by name, SI.
         title: Headline; by default verdict, terminal time, mass and miss.
     """
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(13.5, 8.0), dpi=120, layout="constrained")
-    figure.suptitle(title or _headline(plan, certificate), fontsize=13, x=0.01, ha="left")
+    figure = new_figure((13.5, 8.0), title or _headline(plan, certificate))
     grid = figure.add_gridspec(2, 3)
     space = figure.add_subplot(grid[0, 0], projection="3d")
     _draw_space(space, plan, certificate, parameters)
@@ -72,15 +74,13 @@ def descent_figure(
     limit = float(np.degrees(parameters["pointing_angle_max"]))
     draw_limit(pointing, limit, "pointing limit", above=True)
     pointing.set_ylim(bottom=0.0)
-    handles, labels = mass.get_legend_handles_labels()
-    figure.legend(handles, labels, loc="upper right", ncols=2, frameon=False)
+    add_legend(figure, mass)
     return figure
 
 
 def _headline(plan: Plan, certificate: PlanCertificate) -> str:
     missed = {c.name: c.worst_value for c in certificate.checks}.get("miss_position")
-    verdict = "certified" if certificate.passed else "NOT certified"
-    text = f"Powered descent, {verdict}: {plan.terminal_time_s:.2f} s, "
+    text = f"Powered descent, {verdict(certificate)}: {plan.terminal_time_s:.2f} s, "
     text += f"{plan.states[-1, 6]:.1f} kg at touchdown"
     return text if missed is None else f"{text}, miss {missed:.2f} m"
 
@@ -89,9 +89,7 @@ def _draw_descent(
     axes: Axes, plan: Plan, certificate: PlanCertificate, parameters: Mapping[str, Any]
 ) -> None:
     target = np.asarray(parameters["final_position"])
-    flown: dict[str, Any] = {"color": FLOWN, "linewidth": 1.6}
-    planned: dict[str, Any] = {"color": PLANNED, "linestyle": "", "marker": ".", "markersize": 5}
-    for states, style in ((certificate.states, flown), (plan.states, planned)):
+    for states, style in ((certificate.states, FLOWN_STYLE), (plan.states, PLANNED_STYLE)):
         offset = states[:, :3] - target
         axes.plot(np.hypot(offset[:, 1], offset[:, 2]), offset[:, 0], **style)
     reach = axes.get_xlim()[1]
