@@ -7,8 +7,7 @@ forward mode of the unrolled map.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from enum import Enum
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.sparse.linalg
@@ -17,46 +16,34 @@ from numpy.typing import NDArray
 from dscp_core.cone.derivative.sensitivity import Linearisation
 from dscp_core.cone.derivative.verdict import GradientVerdict
 from dscp_core.errors import DscpError, InvalidInputError
+from dscp_core.gradients.gradient import Gradient, Method
 from dscp_core.gradients.losses import Loss
+from dscp_core.gradients.quantities import quantity
 from dscp_core.scp.scp import Iteration, Scp, ScpResult, ScpStatus
 
+__all__ = [
+    "DifferentiationError",
+    "Gradient",
+    "Method",
+    "Tangent",
+    "implicit",
+    "is_feasible",
+    "of_plan",
+    "settle",
+    "tangent",
+    "unrolled",
+]
+
 Array = NDArray[np.float64]
+
+_SETTLED = 1e-5
+"""Change of the scaled trajectory by one more iteration, below which it is a fixed point."""
+_SETTLING_ITERATIONS = 10
+_MOST_SETTLING_ITERATIONS = 60
 
 
 class DifferentiationError(DscpError):
     """A trace that cannot be differentiated."""
-
-
-class Method(Enum):
-    """How a gradient was computed."""
-
-    UNROLLED = "unrolled"
-    IMPLICIT = "implicit"
-
-
-@dataclass(frozen=True)
-class Gradient:
-    """Gradient of a loss with respect to every parameter.
-
-    Attributes:
-        value: The loss.
-        parameters: (P,) gradient with respect to the packed parameters, per SI unit.
-        initial_reference: Gradient with respect to the scaled reference vector that the run
-            started from; zero for the implicit method. When the problem's own guess was the
-            start, its dependence on the parameters is already in ``parameters``.
-        trusted: Whether the gradient can be relied upon.
-        reasons: Why not, in words with numbers.
-        verdicts: Verdict of every differentiated iteration, first iteration first.
-        method: How it was computed.
-    """
-
-    value: float
-    parameters: Array
-    initial_reference: Array
-    trusted: bool
-    reasons: tuple[str, ...]
-    verdicts: tuple[GradientVerdict, ...]
-    method: Method
 
 
 @dataclass(frozen=True)
@@ -108,14 +95,8 @@ def unrolled(scp: Scp, trace: ScpResult, loss: Loss) -> Gradient:
         parameters += transcription.initial_guess_pullback(trace.parameters, carried)
     verdicts.reverse()
     reasons = _reasons(verdicts) + _non_finite(parameters)
-    return Gradient(
-        value=loss.value(transcription, trace),
-        parameters=parameters,
-        initial_reference=carried,
-        trusted=not reasons,
-        reasons=reasons,
-        verdicts=tuple(verdicts),
-        method=Method.UNROLLED,
+    return _gradient(
+        scp, trace, loss, parameters, carried, Method.UNROLLED, reasons, verdicts, settled=None
     )
 
 
@@ -176,16 +157,114 @@ def implicit(
         reasons += (f"fixed-point equation solved to {residual:.1e} only, above 1e-7",)
     # Where the cost is flat it converges long before the trajectory does.
     drift = float(np.max(np.abs(reference - solution.z[:size])))
-    if drift > 1e-5:
+    if drift > _SETTLED:
         reasons += (f"not settled: another iteration moves it by {drift:.1e} (scaled)",)
+    return _gradient(
+        scp,
+        trace,
+        loss,
+        parameters,
+        np.zeros(size),
+        Method.IMPLICIT,
+        reasons,
+        [linearisation.verdict],
+        settled=drift <= _SETTLED,
+    )
+
+
+def of_plan(scp: Scp, trace: ScpResult, loss: Loss, method: Method) -> Gradient:
+    """Gradient that is trusted only where the run ended with a plan.
+
+    Args:
+        scp: The loop that made the trace.
+        trace: Its result.
+        loss: Scalar of the trace.
+        method: How to differentiate.
+
+    Raises:
+        DifferentiationError: The trace ended without a usable result, or the gradient overflows.
+        InvalidInputError: The implicit method, and a loss that depends on earlier iterates.
+    """
+    compute = unrolled if method is Method.UNROLLED else implicit
+    gradient = compute(scp, trace, loss)
+    reasons = gradient.reasons
+    if trace.status in (ScpStatus.INFEASIBLE, ScpStatus.SUBPROBLEM_INFEASIBLE) or (
+        method is Method.IMPLICIT and not gradient.feasible
+    ):
+        last, layout = trace.iterations[-1], scp.transcription.layout
+        reasons += (
+            f"no feasible trajectory: virtual control {layout.relative(last.virtual_control):.1e}, "
+            f"defect {layout.relative(last.defects):.1e} (scaled)",
+        )
+    elif trace.status is ScpStatus.ITERATION_LIMIT:
+        reasons += (f"not converged, so not the gradient of an optimum: {trace.message}",)
+    return replace(gradient, trusted=not reasons, reasons=reasons)
+
+
+def settle(scp: Scp, parameters: Array, reference: Array) -> ScpResult:
+    """Iterate from a trajectory until it stands still: a fixed point to differentiate.
+
+    Where the cost is flat, the test of convergence ends the iterations long before.
+
+    Args:
+        scp: A loop with options for gradients.
+        parameters: Packed parameters, SI.
+        reference: Scaled reference vector to start from.
+
+    Returns:
+        The last run, of a few iterations; `implicit` says whether it settled.
+    """
+    few = scp.with_options(fixed_iterations=_SETTLING_ITERATIONS, deadline_s=None)
+    for _ in range(_MOST_SETTLING_ITERATIONS // _SETTLING_ITERATIONS):
+        trace = few.run(parameters, reference)
+        if not trace.succeeded:
+            break
+        reference = trace.final_reference
+        if np.max(np.abs(reference - trace.iterations[-1].reference)) <= _SETTLED / 10.0:
+            break
+    return trace
+
+
+def is_feasible(scp: Scp, trace: ScpResult) -> bool:
+    """Whether a run ended at a trajectory that satisfies the dynamics, without virtual control."""
+    if not trace.iterations:
+        return False
+    last, layout = trace.iterations[-1], scp.transcription.layout
+    return (
+        layout.relative(last.virtual_control) <= scp.virtual_control_tolerance
+        and layout.relative(last.defects) <= 10.0 * scp.defect_tolerance
+    )
+
+
+def _gradient(
+    scp: Scp,
+    trace: ScpResult,
+    loss: Loss,
+    parameters: Array,
+    initial_reference: Array,
+    method: Method,
+    reasons: tuple[str, ...],
+    verdicts: list[GradientVerdict],
+    *,
+    settled: bool | None,
+) -> Gradient:
+    transcription = scp.transcription
     return Gradient(
         value=loss.value(transcription, trace),
         parameters=parameters,
-        initial_reference=np.zeros(size),
+        initial_reference=initial_reference,
         trusted=not reasons,
         reasons=reasons,
-        verdicts=(linearisation.verdict,),
-        method=Method.IMPLICIT,
+        verdicts=tuple(verdicts),
+        method=method,
+        of=quantity(transcription.problem, loss),
+        iterations=len(trace.iterations),
+        stopped=trace.status,
+        feasible=is_feasible(scp, trace),
+        settled=settled,
+        terminal_time_s=transcription.terminal_time(trace.final_reference, trace.parameters),
+        free_terminal_time=transcription.layout.free_terminal_time,
+        problem=transcription.problem,
     )
 
 

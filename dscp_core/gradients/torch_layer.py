@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 from torch.autograd.function import once_differentiable
 
 from dscp_core.errors import InvalidInputError
+from dscp_core.gradients.gradient import Gradient, Method, parts, positions
 from dscp_core.gradients.losses import Loss, LossGradient
-from dscp_core.gradients.run import DifferentiationError, Gradient, Method, implicit, unrolled
+from dscp_core.gradients.run import DifferentiationError, implicit, unrolled
 from dscp_core.problem.declaration import TERMINAL_TIME
 from dscp_core.problem.parameters import Value
 from dscp_core.scp.scp import Scp, ScpResult, ScpStatus
@@ -106,8 +107,8 @@ class TrajectoryBatch:
     samples: tuple[SampleReport, ...]
 
 
-class _DscpLayer(torch.nn.Module, ABC):
-    """What both layers share: named inputs, and one differentiable run per sample."""
+class DscpLayer(torch.nn.Module, ABC):
+    """What the layers share: named inputs, and one differentiable run per sample."""
 
     def __init__(
         self,
@@ -117,13 +118,14 @@ class _DscpLayer(torch.nn.Module, ABC):
         method: Method,
     ) -> None:
         super().__init__()
-        table = scp.transcription.table
+        problem = scp.transcription.problem
         self._scp = scp
         self._method = method
-        self._slices = {name: table.slice(name) for name in inputs}
-        if not inputs or len(self._slices) != len(inputs):
+        self._positions = {name: positions(problem, name) for name in inputs}
+        self._parts = tuple(part for name in inputs for part in parts(problem, name))
+        if not inputs or len(set(self._parts)) != len(self._parts):
             raise InvalidInputError("inputs", tuple(inputs), "one or more names, each given once")
-        self._base = torch.from_numpy(table.pack(parameters))
+        self._base = torch.from_numpy(problem.table.pack(parameters))
 
     @property
     def transcription(self) -> Transcription:
@@ -146,12 +148,25 @@ class _DscpLayer(torch.nn.Module, ABC):
         """Trace of one sample and its message, or None and why it never started."""
         table = self._scp.transcription.table
         try:
-            for name, where in self._slices.items():
-                table[name].validate(parameters[where])
+            for name in self._parts:
+                table[name].validate(parameters[table.slice(name)])
             trace = self._scp.run(parameters, reference)
         except InvalidInputError as error:
             return None, str(error)
         return trace, trace.message
+
+    def usable(self, trace: ScpResult) -> bool:
+        """Whether a run has an output and a gradient."""
+        return bool(trace.iterations) and trace.status not in _WITHOUT_GRADIENT
+
+    def differentiate(self, trace: ScpResult, loss: Loss) -> Gradient:
+        """Gradient of a loss of a usable trace.
+
+        Raises:
+            DifferentiationError: There is none.
+        """
+        compute = unrolled if self._method is Method.UNROLLED else implicit
+        return compute(self._scp, trace, loss)
 
     def pull(self, trace: ScpResult, cotangent: Array) -> Gradient:
         """Gradient of ``cotangent . output`` for one sample.
@@ -162,8 +177,7 @@ class _DscpLayer(torch.nn.Module, ABC):
         if not np.all(np.isfinite(cotangent)):
             raise DifferentiationError("the gradient that reached the layer is not finite")
         loss, factor = self.loss_of(cotangent)
-        differentiate = unrolled if self._method is Method.UNROLLED else implicit
-        gradient = differentiate(self._scp, trace, loss)
+        gradient = self.differentiate(trace, loss)
         pulled = replace(
             gradient,
             parameters=factor * gradient.parameters,
@@ -188,15 +202,15 @@ class _DscpLayer(torch.nn.Module, ABC):
         return outputs, packed, tuple(reports)
 
     def _packed(self, inputs: Mapping[str, torch.Tensor]) -> torch.Tensor:
-        if set(inputs) != set(self._slices):
-            raise InvalidInputError("inputs", sorted(inputs), f"exactly {sorted(self._slices)}")
+        if set(inputs) != set(self._positions):
+            raise InvalidInputError("inputs", sorted(inputs), f"exactly {sorted(self._positions)}")
         first = next(iter(inputs.values()))
         batch = first.shape[0] if first.dim() else 0
         packed = self._base.expand(batch, -1)
-        for name, where in self._slices.items():
+        for name, where in self._positions.items():
             tensor = inputs[name][:, None] if inputs[name].dim() == 1 else inputs[name]
-            matrix = _matrix(name, tensor, (batch, where.stop - where.start))
-            packed = packed.index_copy(1, torch.arange(where.start, where.stop), matrix)
+            matrix = _matrix(name, tensor, (batch, where.size))
+            packed = packed.index_copy(1, torch.from_numpy(where), matrix)
         return packed
 
 
@@ -206,7 +220,7 @@ class _Solve(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any,
-        layer: _DscpLayer,
+        layer: DscpLayer,
         reports: list[SampleReport],
         packed: torch.Tensor,
         initial_reference: torch.Tensor | None,
@@ -219,7 +233,7 @@ class _Solve(torch.autograd.Function):
             trace, message = layer.run(row, None if references is None else references[sample])
             status = None if trace is None else trace.status
             count = 0 if trace is None else len(trace.iterations)
-            usable = trace is not None and count > 0 and status not in _WITHOUT_GRADIENT
+            usable = trace is not None and layer.usable(trace)
             if trace is not None and usable:
                 outputs[sample] = layer.output(trace)
             traces.append(trace if usable else None)
@@ -230,7 +244,7 @@ class _Solve(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad_output: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
-        layer: _DscpLayer = ctx.layer
+        layer: DscpLayer = ctx.layer
         layout, table = layer.transcription.layout, layer.transcription.table
         cotangents = grad_output.numpy()
         parameters = np.zeros((len(ctx.traces), table.size))
@@ -256,7 +270,25 @@ class _Solve(torch.autograd.Function):
         )
 
 
-class DscpLossLayer(_DscpLayer):
+class LossLayer(DscpLayer):
+    """What layers share whose output is one loss."""
+
+    _loss: Loss
+
+    def output_size(self) -> int:
+        """One."""
+        return 1
+
+    def output(self, trace: ScpResult) -> Array:
+        """(1,) the loss."""
+        return np.array([self._loss.value(self.transcription, trace)])
+
+    def loss_of(self, cotangent: Array) -> tuple[Loss, float]:
+        """The loss and the cotangent."""
+        return self._loss, float(cotangent[0])
+
+
+class DscpLossLayer(LossLayer):
     """Loss of an SCP run as a function of named parameters."""
 
     def __init__(
@@ -300,20 +332,8 @@ class DscpLossLayer(_DscpLayer):
         outputs, _, reports = self._solve(inputs, initial_reference)
         return LossBatch(outputs[:, 0], reports)
 
-    def output_size(self) -> int:
-        """One."""
-        return 1
 
-    def output(self, trace: ScpResult) -> Array:
-        """(1,) the loss."""
-        return np.array([self._loss.value(self.transcription, trace)])
-
-    def loss_of(self, cotangent: Array) -> tuple[Loss, float]:
-        """The loss and the cotangent."""
-        return self._loss, float(cotangent[0])
-
-
-class DscpTrajectoryLayer(_DscpLayer):
+class DscpTrajectoryLayer(DscpLayer):
     """Final trajectory of an SCP run as a function of named parameters."""
 
     def __init__(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 from dscp_core.errors import InvalidInputError
 from dscp_core.planning.certificate import PlanVerifier
 from dscp_core.planning.plan import Plan, PlanOutcome, PlanStatus, TerminalTime
-from dscp_core.problem.declaration import TERMINAL_TIME
+from dscp_core.problem.declaration import TERMINAL_TIME, OptimalControlProblem
 from dscp_core.scp.scp import Iteration, Scp, ScpResult, ScpStatus
 
 Array = NDArray[np.float64]
@@ -47,14 +48,22 @@ class Start:
 class Attempt:
     """The runs of one call of `dscp_core.planning.planner.Planner.plan`."""
 
-    def __init__(self, verifier: PlanVerifier, started: float, deadline_s: float | None) -> None:
+    def __init__(
+        self,
+        problem: OptimalControlProblem,
+        verifier: PlanVerifier,
+        started: float,
+        deadline_s: float | None,
+    ) -> None:
         """Begin.
 
         Args:
+            problem: What is planned.
             verifier: Certifies the plans.
             started: When the call came, by ``time.perf_counter``.
             deadline_s: Wall time from then on for the iterations of all runs, or None.
         """
+        self._problem = problem
         self._verifier = verifier
         self._started = started
         self._deadline_s = deadline_s
@@ -63,9 +72,9 @@ class Attempt:
         self.predicted_s: float | None = None
         self.reason = ""
 
-    def invalid(self, message: str, terminal_time_s: float, source: TerminalTime) -> PlanOutcome:
+    def invalid(self, message: str, packed: Array, source: TerminalTime) -> PlanOutcome:
         """Outcome for a state that was refused."""
-        return self._nothing(PlanStatus.INVALID_STATE, message, terminal_time_s, source)
+        return self._outcome(PlanStatus.INVALID_STATE, message, packed, source)
 
     def with_all_runs(self, outcome: PlanOutcome) -> PlanOutcome:
         """An earlier run's outcome, with the iterations and times of all of them."""
@@ -85,47 +94,27 @@ class Attempt:
         try:
             result = scp.run(start.parameters, start.reference)
         except InvalidInputError as error:  # a guess that is not finite
-            time_s = float(start.parameters[scp.transcription.table.slice(TERMINAL_TIME)][0])
-            return self._nothing(
-                PlanStatus.SOLVER_FAILURE, f"no first iteration: {error}", time_s, start.source
-            )
+            message = f"no first iteration: {error}"
+            return self._outcome(PlanStatus.SOLVER_FAILURE, message, start.parameters, start.source)
         self._iterations += len(result.iterations)
         self._solver_time += sum(i.solve_seconds for i in result.iterations)
         if result.failed is not None:
             self._solver_time += result.failed.seconds
-        return self._outcome(start, result, _chosen(scp, result))
-
-    def _nothing(
-        self, status: PlanStatus, message: str, terminal_time_s: float, source: TerminalTime
-    ) -> PlanOutcome:
-        """Outcome without any iterate."""
-        return PlanOutcome(
-            status=status,
-            message=message,
-            plan=None,
-            certificate=None,
-            iterations=self._iterations,
-            solve_time_s=time.perf_counter() - self._started,
-            solver_time_s=self._solver_time,
-            virtual_control=math.inf,
-            max_defect=math.inf,
-            cost=math.inf,
-            terminal_time_predicted_s=self.predicted_s,
-            terminal_time_used_s=terminal_time_s,
-            terminal_time_source=source,
-            terminal_time_reason=self.reason,
-            warm_started=False,
-            solver="",
-        )
-
-    def _outcome(self, start: Start, result: ScpResult, chosen: Iteration | None) -> PlanOutcome:
         status = _STATUS.get(result.status, PlanStatus.CERTIFIED)
         message = f"{result.status.value}: {result.message}"
-        plan, certificate = None, None
-        used = start.scp.transcription.terminal_time(result.final_reference, result.parameters)
+        last = result.failed or (result.iterations[-1].solution if result.iterations else None)
+        found: dict[str, Any] = {
+            "stopped": result.status,
+            "terminal_time_used_s": scp.transcription.terminal_time(
+                result.final_reference, result.parameters
+            ),
+            "warm_started": result.warm_started,
+            "solver": "" if last is None else last.solver,
+        }
+        chosen = _chosen(scp, result)
         if chosen is not None:
-            plan = self._plan(start.scp, chosen.solution.z, result.parameters)
-            used = plan.terminal_time_s
+            layout = scp.transcription.layout
+            plan = self._plan(scp, chosen.solution.z, result.parameters)
             certificate = self._verifier.certify(
                 plan.times_s, plan.states, plan.controls, result.parameters
             )
@@ -136,28 +125,57 @@ class Attempt:
                     status = PlanStatus.NOT_CERTIFIED
             if not certificate.passed:
                 message += "; certificate: " + "; ".join(certificate.reasons)
-        last = result.failed or (result.iterations[-1].solution if result.iterations else None)
+            found |= {
+                "converged": result.status is ScpStatus.CONVERGED
+                and chosen is result.iterations[-1]
+                and _satisfies_dynamics(scp, chosen),
+                "plan": plan,
+                "certificate": certificate,
+                "terminal_time_used_s": plan.terminal_time_s,
+                "virtual_control": layout.relative(chosen.virtual_control),
+                "max_defect": layout.relative(chosen.defects),
+                "cost": chosen.cost,
+            }
+        return self._outcome(status, message, start.parameters, start.source, **found)
+
+    def _outcome(
+        self,
+        status: PlanStatus,
+        message: str,
+        packed: Array,
+        source: TerminalTime,
+        **found: Any,
+    ) -> PlanOutcome:
+        """Outcome with what was found, and the values of nothing for the rest."""
+        parameters = self._problem.table.unpack(packed)
+        values: dict[str, Any] = {
+            "stopped": None,
+            "converged": False,
+            "plan": None,
+            "certificate": None,
+            "virtual_control": math.inf,
+            "max_defect": math.inf,
+            "cost": math.inf,
+            "terminal_time_used_s": parameters[TERMINAL_TIME],
+            "warm_started": False,
+            "solver": "",
+        }
         return PlanOutcome(
             status=status,
             message=message,
-            plan=plan,
-            certificate=certificate,
             iterations=self._iterations,
             solve_time_s=time.perf_counter() - self._started,
             solver_time_s=self._solver_time,
-            virtual_control=_largest(start.scp, chosen, "virtual_control"),
-            max_defect=_largest(start.scp, chosen, "defects"),
-            cost=math.inf if chosen is None else chosen.cost,
+            cost_unit=self._problem.cost_unit,
             terminal_time_predicted_s=self.predicted_s,
-            terminal_time_used_s=used,
-            terminal_time_source=start.source,
+            terminal_time_source=source,
             terminal_time_reason=self.reason,
-            warm_started=result.warm_started,
-            solver="" if last is None else last.solver,
+            parameters=parameters,
+            **(values | found),
         )
 
     def _plan(self, scp: Scp, z: Array, parameters: Array) -> Plan:
-        problem, layout = scp.transcription.problem, scp.transcription.layout
+        problem, layout = self._problem, scp.transcription.layout
         terminal_time = scp.transcription.terminal_time(z, parameters)
         states, controls = layout.states(z), layout.controls(z)
         return Plan(
@@ -176,15 +194,11 @@ class Attempt:
 def _chosen(scp: Scp, result: ScpResult) -> Iteration | None:
     """The last iterate that satisfies the dynamics, else the last one."""
     for iteration in reversed(result.iterations):
-        if _relative(scp, iteration.defects) <= 10.0 * scp.defect_tolerance:
+        if _satisfies_dynamics(scp, iteration):
             return iteration
     return result.iterations[-1] if result.iterations else None
 
 
-def _largest(scp: Scp, chosen: Iteration | None, name: str) -> float:
-    return math.inf if chosen is None else _relative(scp, getattr(chosen, name))
-
-
-def _relative(scp: Scp, residual: Array) -> float:
-    """Largest entry, relative to the states' scales."""
-    return float(np.max(np.abs(residual) / scp.transcription.layout.state_scale))
+def _satisfies_dynamics(scp: Scp, iteration: Iteration) -> bool:
+    defect = scp.transcription.layout.relative(iteration.defects)
+    return defect <= 10.0 * scp.defect_tolerance

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from enum import Enum, IntEnum
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dscp_core.planning.certificate import PlanCertificate
+from dscp_core.scp.trace import ScpStatus
 
 Array = NDArray[np.float64]
 
@@ -70,6 +73,9 @@ class PlanOutcome:
 
     Attributes:
         status: What became of it.
+        stopped: Why the iterations stopped; None when they never started.
+        converged: Whether they stopped because nothing changed any more, and the plan is where
+            they did, satisfying the dynamics: only then is its cost that of a local optimum.
         message: In words, with numbers.
         plan: The trajectory, also of an attempt that was not certified; None without any.
         certificate: Its check, or None.
@@ -78,16 +84,20 @@ class PlanOutcome:
         solver_time_s: Part of it spent in the cone solver.
         virtual_control: Largest virtual control, relative to the states' scales.
         max_defect: Largest defect of the discrete dynamics, relative to the states' scales.
-        cost: Cost of the plan in the problem's units (powered descent: minus the final mass, kg).
+        cost: Cost of the plan in the problem's unit.
+        cost_unit: That unit; "1" for a pure number.
         terminal_time_predicted_s: Prediction of the terminal-time predictor, or None.
         terminal_time_used_s: Terminal time of the plan, or the one that was tried.
         terminal_time_source: Where that one comes from.
         terminal_time_reason: Why from there, where the settings name another source; else empty.
         warm_started: Whether the result came from the last plan.
         solver: Backend that answered last.
+        parameters: What was planned with, by name, SI: initial state and terminal time included.
     """
 
     status: PlanStatus
+    stopped: ScpStatus | None
+    converged: bool
     message: str
     plan: Plan | None
     certificate: PlanCertificate | None
@@ -97,9 +107,49 @@ class PlanOutcome:
     virtual_control: float
     max_defect: float
     cost: float
+    cost_unit: str
     terminal_time_predicted_s: float | None
     terminal_time_used_s: float
     terminal_time_source: TerminalTime
     terminal_time_reason: str
     warm_started: bool
     solver: str
+    parameters: Mapping[str, Any] = field(repr=False)
+
+    @property
+    def certified(self) -> bool:
+        """Whether the plan, flown with the true dynamics, passed every check."""
+        return self.status is PlanStatus.CERTIFIED
+
+    @property
+    def headline(self) -> str:
+        """What this is worth, in one line: feasible? converged? at which cost?"""
+        words, why = _WORDS[self.status], " ".join(self.message.split())
+        if self.status not in (PlanStatus.CERTIFIED, PlanStatus.NOT_CERTIFIED):
+            return f"{words}: {why}"
+        unit = "" if self.cost_unit == "1" else f" {self.cost_unit}"
+        source = self.terminal_time_source.value
+        facts = f"terminal time {self.terminal_time_used_s:.4g} s ({source}), cost {self.cost:.7g}"
+        if self.converged:
+            return f"{words}, converged: {facts}{unit}"
+        return f"{words}, {_doubt(self.stopped)}: {facts}{unit}, which may not be the least"
+
+
+def _doubt(stopped: ScpStatus | None) -> str:
+    """Why a plan's iterations cannot be called converged."""
+    if stopped is ScpStatus.FIXED_ITERATIONS:
+        return f"convergence NOT tested ({stopped.value})"
+    if stopped is ScpStatus.CONVERGED:
+        return "NOT converged (where the iterations stopped, the dynamics do not hold)"
+    return f"NOT converged ({'no iterations' if stopped is None else stopped.value})"
+
+
+_WORDS = {
+    PlanStatus.CERTIFIED: "certified",
+    PlanStatus.NOT_CERTIFIED: "NOT certified",
+    PlanStatus.INFEASIBLE: "infeasible",
+    PlanStatus.ITERATION_LIMIT: "no plan (iteration limit)",
+    PlanStatus.DEADLINE: "no plan (deadline)",
+    PlanStatus.SOLVER_FAILURE: "no plan (solver failure)",
+    PlanStatus.INVALID_STATE: "no plan (invalid state)",
+}

@@ -4,22 +4,33 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, replace
-from typing import Any, Protocol
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
 from dscp_core.errors import InvalidInputError
+from dscp_core.gradients.gradient import Gradient, Method
+from dscp_core.gradients.losses import Loss
+from dscp_core.gradients.quantities import quantity
 from dscp_core.planning.attempt import Attempt, Start
-from dscp_core.planning.certificate import ControlHold, PlanVerifier
+from dscp_core.planning.certificate import PlanVerifier
+from dscp_core.planning.differentiation import differentiable, plan_gradient, suited_method
 from dscp_core.planning.plan import Plan, PlanOutcome, PlanStatus, TerminalTime
+from dscp_core.planning.settings import PlannerSettings, TerminalTimePredictor
 from dscp_core.problem.declaration import TERMINAL_TIME, OptimalControlProblem
 from dscp_core.problem.parameters import Value
-from dscp_core.scp.scp import Scp, ScpOptions, ScpStatus
+from dscp_core.scp.scp import Scp, ScpStatus
 from dscp_core.transcription.transcription import Transcription
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from dscp_core.gradients.plan_layer import PlanLayer
 
 __all__ = ["Planner", "PlannerSettings", "TerminalTime", "TerminalTimePredictor"]
 
@@ -33,53 +44,6 @@ _LEAST_REMAINING = 0.05
 # box about the paper's case, 6.2 against 6.2 at 0.05 and 6.5 against 5.0 at 0.1; with a free one,
 # 4.9 against 5.2 at 0.1 and 5.7 against 5.5 at 0.2. A fixed one stays that of the plan anyway.
 _NEAR = {TerminalTime.PREDICTED: 0.05, TerminalTime.FREE: 0.2, TerminalTime.FIXED: math.inf}
-
-
-class TerminalTimePredictor(Protocol):
-    """Predicts the optimal terminal time of a state."""
-
-    def predict(self, state: Array) -> float:
-        """Terminal time in seconds for a state (nx,), SI.
-
-        Raises:
-            InvalidInputError: It does not know this state.
-        """
-        ...
-
-
-@dataclass(frozen=True)
-class PlannerSettings:
-    """How to plan, and with which parameters; `suited` has what suits a problem.
-
-    Attributes:
-        parameters: Vehicle, mission and algorithm parameters that differ from the defaults, SI.
-        intervals: Number N of intervals.
-        terminal_time: Where the terminal time comes from.
-        hold: How the certificate flies the controls between the nodes.
-        options: How to iterate; its deadline is set for every plan.
-    """
-
-    parameters: Mapping[str, Value] = field(default_factory=dict)
-    intervals: int = 50
-    terminal_time: TerminalTime = TerminalTime.FIXED
-    hold: ControlHold = ControlHold.MEAN
-    options: ScpOptions = field(default_factory=ScpOptions)
-
-    @staticmethod
-    def suited(problem: OptimalControlProblem, **changes: Any) -> PlannerSettings:
-        """Settings with the number of intervals and the terminal time that suit a problem.
-
-        Args:
-            problem: The declaration.
-            **changes: Other attributes.
-        """
-        own: dict[str, Any] = {
-            "intervals": problem.default_intervals,
-            "terminal_time": TerminalTime.FREE
-            if problem.free_terminal_time
-            else TerminalTime.FIXED,
-        }
-        return PlannerSettings(**{**own, **changes})
 
 
 @dataclass(frozen=True)
@@ -118,18 +82,31 @@ class Planner:
         problem: OptimalControlProblem,
         settings: PlannerSettings | None = None,
         predictor: TerminalTimePredictor | None = None,
+        *,
+        vehicle: str | Path | None = None,
+        parameters: Mapping[str, Value] | None = None,
     ) -> None:
         """Compile the problem.
 
         Args:
-            problem: The declaration.
+            problem: The declaration, for example from `dscp_core.problems.get`.
             settings: How to plan; None for what suits the problem.
             predictor: Needed for, and only for, `TerminalTime.PREDICTED`.
+            vehicle: YAML file of parameter names and SI values, which win over the settings'.
+            parameters: Values by name, SI, which win over both.
 
         Raises:
-            InvalidInputError: Unknown parameter or value, or a missing predictor.
+            InvalidInputError: Unknown parameter or value, a file that cannot be used, a missing
+                predictor, or no problem.
         """
+        if not isinstance(problem, OptimalControlProblem):
+            raise InvalidInputError(
+                "problem", problem, "an OptimalControlProblem; problems.get(NAME) gives one"
+            )
         settings = PlannerSettings.suited(problem) if settings is None else settings
+        changed = {} if vehicle is None else problem.read_vehicle(vehicle)
+        changed |= parameters or {}
+        settings = replace(settings, parameters={**settings.parameters, **changed})
         if (settings.terminal_time is TerminalTime.PREDICTED) != (predictor is not None):
             raise InvalidInputError(
                 "predictor",
@@ -200,7 +177,7 @@ class Planner:
 
     def plan(
         self,
-        state: Array,
+        state: Array | Sequence[float] | None = None,
         *,
         deadline_s: float | None = None,
         warm_start: Plan | None = None,
@@ -214,17 +191,18 @@ class Planner:
         does not know, has a free terminal time.
 
         Args:
-            state: (nx,), SI, in the order of `state_names`.
+            state: (nx,), SI, in the order of `state_names`; None for `initial_state`.
             deadline_s: Wall time for the SCP iterations, or None.
             warm_start: A plan of the same vehicle to start from, if the state is near it.
             elapsed_s: Flight time between that plan's start and this state.
         """
-        attempt = Attempt(self._verifier, time.perf_counter(), deadline_s)
+        state = self.initial_state if state is None else np.asarray(state, dtype=np.float64)
+        attempt = Attempt(self.problem, self._verifier, time.perf_counter(), deadline_s)
         source = self.settings.terminal_time
         try:
             packed = self.check_state(state)
         except InvalidInputError as error:
-            return attempt.invalid(str(error), self._terminal_time(self.parameters), source)
+            return attempt.invalid(str(error), self.parameters, source)
         left = self._left(warm_start, elapsed_s, state)
         if self._predictor is not None:
             try:
@@ -307,6 +285,73 @@ class Planner:
             seconds = guess(state, self.problem.table.unpack(packed))
             yield Start(scp, self._with_time(packed, seconds), None, source)
 
+    def gradient(
+        self, of: str | Loss, *, at: PlanOutcome | None = None, method: Method | None = None
+    ) -> Gradient:
+        """Gradient of a plan by every parameter that it was made with.
+
+        The implicit method, which is the default, iterates from the plan's own trajectory until it
+        stands still, with polished and tightly solved subproblems, and differentiates that fixed
+        point: the optimum of the discretised problem, whatever the way there. It is zero for
+        parameters of the algorithm. The unrolled method, the default for ``"convergence"``, runs
+        again from the problem's guess and differentiates these K iterations. A terminal time that
+        is fixed or predicted is held fixed but for its own derivative; a free one moves along with
+        the optimum. The number of intervals is fixed. The gradient is not trusted where no feasible
+        plan is there, or where what is differentiated is not the plan any more.
+
+        Args:
+            of: ``"cost"``; a state's name, for its final value; ``"convergence"``, the sum of
+                ``|J_k - J_K|`` over the iterations; or any loss.
+            at: Outcome of `plan`, whose state, terminal time and vehicle count, not this
+                planner's; None for a plan from `initial_state`.
+            method: How to differentiate; None for the default.
+
+        Raises:
+            DifferentiationError: There is no plan, or its run has no gradient.
+            InvalidInputError: A plan of another problem or with other intervals, an unknown
+                quantity, or one that the method cannot differentiate.
+        """
+        outcome = self.plan() if at is None else at
+        free = outcome.terminal_time_source is TerminalTime.FREE
+        return plan_gradient(self._free if free else self.scp, outcome, of, method)
+
+    def layer(
+        self, of: str | Loss, inputs: Sequence[str], *, method: Method | None = None
+    ) -> PlanLayer:
+        """A PyTorch module from named tensors to a scalar of the plans, one per sample.
+
+        Args:
+            of: See `gradient`.
+            inputs: Names of parameters that vary; ``"initial_state"`` for all that hold it.
+            method: See `gradient`.
+
+        Raises:
+            InvalidInputError: An unknown name.
+        """
+        from dscp_core.gradients.plan_layer import PlanLayer
+
+        loss = quantity(self.problem, of).loss
+        scp = differentiable(self.scp)
+        return PlanLayer(scp, inputs, loss, self.parameters, suited_method(loss, method))
+
+    def figure(self, outcome: PlanOutcome, title: str | None = None) -> Figure:
+        """The plan of an outcome as it was made, and as it went when it was flown.
+
+        Args:
+            outcome: With a plan.
+            title: Headline; by default verdict, terminal time, and what else counts.
+
+        Raises:
+            InvalidInputError: There is no plan.
+        """
+        from dscp_core.planning.histories import plan_figure
+
+        if outcome.plan is None or outcome.certificate is None:
+            raise InvalidInputError("outcome", outcome.headline, "one with a plan")
+        return plan_figure(
+            self.problem, outcome.plan, outcome.certificate, outcome.parameters, title
+        )
+
     def least_terminal_time(self, state: Array) -> float | None:
         """Least feasible terminal time of a state in seconds, or None when none was found.
 
@@ -332,9 +377,6 @@ class Planner:
         if result.status is not ScpStatus.CONVERGED:
             return None
         return fastest.transcription.terminal_time(result.final_reference, result.parameters)
-
-    def _terminal_time(self, packed: Array) -> float:
-        return float(packed[self._time][0])
 
     def _with_time(self, packed: Array, seconds: float) -> Array:
         changed = packed.copy()

@@ -15,6 +15,7 @@ from rclpy.serialization import deserialize_message, serialize_message
 
 from dscp_core.planning.certificate import Check, ControlHold, PlanCertificate
 from dscp_core.planning.plan import PlanOutcome, PlanStatus, TerminalTime
+from dscp_core.scp.trace import ScpStatus
 from msg_adapters.diagnostics import Health, health_from_message, message_from_health
 from msg_adapters.errors import InputCode, RejectedInputError
 from msg_adapters.report import (
@@ -112,6 +113,8 @@ def test_report_round_trip_is_exact(report):
 def outcome(**changes) -> PlanOutcome:
     values = {
         "status": PlanStatus.CERTIFIED,
+        "stopped": ScpStatus.CONVERGED,
+        "converged": True,
         "message": "certified",
         "plan": None,
         "certificate": None,
@@ -121,12 +124,14 @@ def outcome(**changes) -> PlanOutcome:
         "virtual_control": 1e-9,
         "max_defect": 1e-8,
         "cost": -31760.0,
+        "cost_unit": "kg",
         "terminal_time_predicted_s": None,
         "terminal_time_used_s": 32.81,
         "terminal_time_source": TerminalTime.FREE,
         "terminal_time_reason": "",
         "warm_started": True,
         "solver": "qoco",
+        "parameters": {},
     }
     return PlanOutcome(**(values | changes))
 

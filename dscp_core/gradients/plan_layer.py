@@ -1,0 +1,99 @@
+"""A PyTorch layer from the parameters of plans to a scalar of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from dscp_core.errors import InvalidInputError
+from dscp_core.gradients.gradient import INITIAL_STATE, Gradient, Method, positions
+from dscp_core.gradients.losses import Loss
+from dscp_core.gradients.run import of_plan, settle
+from dscp_core.gradients.torch_layer import LossLayer, SampleReport
+from dscp_core.problem.declaration import TERMINAL_TIME
+from dscp_core.scp.scp import Scp, ScpResult, ScpStatus
+
+Array = NDArray[np.float64]
+
+
+class PlanLayer(LossLayer):
+    """A scalar of plans as a function of named parameters; `Planner.layer` makes it.
+
+    A sample without a feasible plan has the loss NaN and the gradient zero, and harms no other:
+    ``loss.nansum()`` leaves it out.
+
+    Attributes:
+        samples: What became of every sample of the last call; its backward pass completes them
+            with the verdict on their gradients.
+    """
+
+    def __init__(
+        self, scp: Scp, inputs: Sequence[str], loss: Loss, parameters: Array, method: Method
+    ) -> None:
+        """Choose inputs and loss.
+
+        Args:
+            scp: The loop to run, with polished subproblems.
+            inputs: Names of parameters, or ``"initial_state"``.
+            loss: Scalar of a trace.
+            parameters: Packed values of all others, SI.
+            method: How to differentiate.
+
+        Raises:
+            InvalidInputError: Unknown parameter, or a terminal time that is a decision.
+        """
+        problem = scp.transcription.problem
+        super().__init__(scp, inputs, problem.table.unpack(parameters), method)
+        if scp.transcription.layout.free_terminal_time and TERMINAL_TIME in inputs:
+            raise InvalidInputError(
+                "inputs", TERMINAL_TIME, "other parameters: it is free, a decision of the solver"
+            )
+        self._loss = loss
+        self.samples: tuple[SampleReport, ...] = ()
+
+    def forward(self, **inputs: torch.Tensor) -> torch.Tensor:
+        """Plan every sample.
+
+        Args:
+            **inputs: One tensor per named input, SI: (B, size), or (B,) for a scalar.
+
+        Returns:
+            (B,) losses; NaN for a sample without a feasible plan.
+
+        Raises:
+            InvalidInputError: A name or a shape does not fit. Bad values fail their sample only.
+        """
+        outputs, _, self.samples = self._solve(inputs, None)
+        usable = torch.tensor([sample.usable for sample in self.samples], dtype=torch.bool)
+        return torch.where(usable, outputs[:, 0], torch.nan)
+
+    def run(self, parameters: Array, reference: Array | None) -> tuple[ScpResult | None, str]:
+        """Trace of one sample, checked as `Planner.plan` checks it, or why there is none."""
+        problem = self.transcription.problem
+        values = problem.table.unpack(parameters)
+        try:
+            if problem.check_parameters is not None:
+                problem.check_parameters(values)
+            if problem.check_state is not None:
+                problem.check_state(parameters[positions(problem, INITIAL_STATE)], values)
+        except InvalidInputError as error:
+            return None, str(error)
+        trace, message = super().run(parameters, reference)
+        if trace is None or self._method is Method.UNROLLED or not trace.succeeded:
+            return trace, message
+        settled = settle(self._scp, parameters, trace.final_reference)
+        if not settled.succeeded:
+            return settled, settled.message
+        return replace(settled, status=trace.status), message
+
+    def usable(self, trace: ScpResult) -> bool:
+        """Whether a run has a loss and a gradient: not where it found no feasible trajectory."""
+        return super().usable(trace) and trace.status is not ScpStatus.INFEASIBLE
+
+    def differentiate(self, trace: ScpResult, loss: Loss) -> Gradient:
+        """Gradient of the loss, trusted only where the run ended with a plan."""
+        return of_plan(self._scp, trace, loss, self._method)

@@ -1,0 +1,95 @@
+"""The gradient of a plan that was made: at its own trajectory, with its own parameters."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from dscp_core.errors import InvalidInputError
+from dscp_core.gradients.gradient import Gradient, Method
+from dscp_core.gradients.losses import ConvergenceLoss, Loss
+from dscp_core.gradients.quantities import quantity
+from dscp_core.gradients.run import DifferentiationError, of_plan, settle
+from dscp_core.planning.plan import Plan, PlanOutcome, TerminalTime
+from dscp_core.scp.scp import GRADIENT_TOLERANCE, Scp, ScpResult
+
+# How far the differentiated trajectory may be from the plan's, in units of the states' scales, and
+# by how many tolerances of the iterations its cost may differ.
+_SAME_TRAJECTORY = 1e-2
+_SAME_COST = 100.0
+
+
+def differentiable(scp: Scp) -> Scp:
+    """The same loop with polished, tightly solved subproblems and no deadline."""
+    settings = scp.options.solver_settings
+    tight = replace(settings, tolerance=min(settings.tolerance, GRADIENT_TOLERANCE))
+    return scp.with_options(polish=True, solver_settings=tight, deadline_s=None)
+
+
+def suited_method(loss: Loss, method: Method | None) -> Method:
+    """The method that was asked for, or else implicit, except for what depends on the way."""
+    if method is not None:
+        return method
+    return Method.UNROLLED if isinstance(loss, ConvergenceLoss) else Method.IMPLICIT
+
+
+def plan_gradient(
+    scp: Scp, outcome: PlanOutcome, of: str | Loss, method: Method | None
+) -> Gradient:
+    """Gradient of a plan; see `dscp_core.planning.planner.Planner.gradient`.
+
+    Args:
+        scp: A loop of the same problem, intervals and kind of terminal time.
+        outcome: With the plan.
+        of: See `dscp_core.gradients.quantities.quantity`.
+        method: How to differentiate, or None for what suits.
+
+    Raises:
+        DifferentiationError: There is no plan, or its run has no gradient.
+        InvalidInputError: A plan of another problem, or an unknown quantity.
+    """
+    problem, layout = scp.transcription.problem, scp.transcription.layout
+    loss = quantity(problem, of).loss
+    chosen = suited_method(loss, method)
+    plan = outcome.plan
+    if plan is None:
+        raise DifferentiationError(f"there is no plan to differentiate: {outcome.headline}")
+    free = outcome.terminal_time_source is TerminalTime.FREE
+    here = (problem.name, layout.intervals, layout.free_terminal_time)
+    there = (plan.problem, len(plan.states) - 1, free)
+    if here != there:
+        given, expected = (
+            f"a plan of {name}, {intervals} intervals, terminal time {'free' if free else 'given'}"
+            for name, intervals, free in (there, here)
+        )
+        raise InvalidInputError("at", given, expected)
+    packed = problem.table.pack(outcome.parameters)
+    loop = differentiable(scp)
+    if chosen is Method.IMPLICIT:
+        reference = layout.reference(plan.states, plan.controls, plan.terminal_time_s)
+        trace = settle(loop, packed, reference)
+    else:
+        trace = loop.run(packed)
+    gradient = of_plan(loop, trace, loss, chosen)
+    moved = _moved(scp, trace, outcome, plan)
+    if moved is None or not gradient.feasible:
+        return gradient
+    return replace(gradient, trusted=False, reasons=(*gradient.reasons, moved))
+
+
+def _moved(scp: Scp, trace: ScpResult, outcome: PlanOutcome, plan: Plan) -> str | None:
+    """Why what was differentiated is not the plan, where that is so."""
+    layout, problem = scp.transcription.layout, scp.transcription.problem
+    distance = layout.relative(layout.states(trace.final_reference) - plan.states)
+    cost = trace.iterations[-1].cost
+    size = max(problem.cost_magnitude or problem.cost_scale, abs(outcome.cost))
+    if distance <= _SAME_TRAJECTORY and np.abs(cost - outcome.cost) <= (
+        _SAME_COST * scp.cost_tolerance * size
+    ):
+        return None
+    return (
+        f"what was differentiated is {distance:.1e} (scaled) from the plan, whose iterations ended "
+        f"with: {'' if outcome.stopped is None else outcome.stopped.value}; cost {cost:.9g} "
+        f"instead of {outcome.cost:.9g}"
+    )

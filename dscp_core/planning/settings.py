@@ -1,0 +1,65 @@
+"""How to plan: settings of a planner, and where a terminal time may come from."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dscp_core.planning.certificate import ControlHold
+from dscp_core.planning.plan import TerminalTime
+from dscp_core.problem.declaration import OptimalControlProblem
+from dscp_core.problem.parameters import Value
+from dscp_core.scp.scp import ScpOptions
+
+Array = NDArray[np.float64]
+
+
+class TerminalTimePredictor(Protocol):
+    """Predicts the optimal terminal time of a state."""
+
+    def predict(self, state: Array) -> float:
+        """Terminal time in seconds for a state (nx,), SI.
+
+        Raises:
+            InvalidInputError: It does not know this state.
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class PlannerSettings:
+    """How to plan, and with which parameters; `suited` has what suits a problem.
+
+    Attributes:
+        parameters: Vehicle, mission and algorithm parameters that differ from the defaults, SI.
+        intervals: Number N of intervals.
+        terminal_time: Where the terminal time comes from.
+        hold: How the certificate flies the controls between the nodes.
+        options: How to iterate; its deadline is set for every plan.
+    """
+
+    parameters: Mapping[str, Value] = field(default_factory=dict)
+    intervals: int = 50
+    terminal_time: TerminalTime = TerminalTime.FIXED
+    hold: ControlHold = ControlHold.MEAN
+    options: ScpOptions = field(default_factory=ScpOptions)
+
+    @staticmethod
+    def suited(problem: OptimalControlProblem, **changes: Any) -> PlannerSettings:
+        """Settings with the number of intervals and the terminal time that suit a problem.
+
+        Args:
+            problem: The declaration.
+            **changes: Other attributes.
+        """
+        own: dict[str, Any] = {
+            "intervals": problem.default_intervals,
+            "terminal_time": TerminalTime.FREE
+            if problem.free_terminal_time
+            else TerminalTime.FIXED,
+        }
+        return PlannerSettings(**{**own, **changes})

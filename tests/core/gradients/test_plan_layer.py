@@ -1,0 +1,125 @@
+"""Plans in PyTorch: named tensors in, one loss per sample out, failures visible."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from core.toy_problems import cart
+
+from dscp_core import InvalidInputError, Method, Planner, PlannerSettings, TerminalTime, problems
+from dscp_core.scp.trace import ScpStatus
+
+
+@pytest.fixture(scope="module")
+def descent() -> Planner:
+    return Planner(problems.get("powered_descent"), PlannerSettings(intervals=20))
+
+
+@pytest.fixture(scope="module")
+def small() -> Planner:
+    problem = replace(cart(), initial_state_parameters=("start",))
+    return Planner(problem, PlannerSettings(intervals=6))
+
+
+def states(planner: Planner, count: int) -> torch.Tensor:
+    return torch.tensor(np.tile(planner.initial_state, (count, 1)), requires_grad=True)
+
+
+@pytest.mark.parametrize("method", list(Method))
+def test_named_tensors_in_losses_out(descent: Planner, method: Method) -> None:
+    layer = descent.layer("cost", ("initial_state", "terminal_time"), method=method)
+    x = states(descent, 2)
+    t = torch.tensor([32.81, 34.0], dtype=torch.float64, requires_grad=True)
+    loss = layer(initial_state=x, terminal_time=t)
+    assert loss.shape == (2,)
+    loss.sum().backward()
+    assert x.grad is not None
+    assert t.grad is not None
+    for row, seconds in enumerate((32.81, 34.0)):
+        planner = Planner(descent.problem, descent.settings, parameters={"terminal_time": seconds})
+        gradient = planner.gradient("cost", method=method)
+        assert float(loss[row].detach()) == pytest.approx(gradient.value, rel=1e-7)
+        expected = gradient["initial_state"]
+        # The fixed point is reached from two sides, to 1e-5 of the states' scales.
+        np.testing.assert_allclose(x.grad[row], expected, rtol=1e-3, atol=1e-6)
+        assert float(t.grad[row]) == pytest.approx(gradient["terminal_time"], rel=1e-2, abs=1e-4)
+        assert layer.samples[row].trusted is gradient.trusted
+        assert layer.samples[row].status is ScpStatus.CONVERGED
+
+
+def test_it_passes_gradcheck(small: Planner) -> None:
+    layer = small.layer("cost", ("initial_state", "drag"))
+    start = torch.tensor([[0.0, 0.0], [0.05, 0.1]], dtype=torch.float64, requires_grad=True)
+    drag = torch.tensor([0.2, 0.4], dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(
+        lambda x, d: layer(initial_state=x, drag=d), (start, drag), eps=1e-5, atol=1e-6
+    )
+    assert all(sample.trusted for sample in layer.samples)
+
+
+def test_a_failed_sample_is_seen_and_harms_no_other(descent: Planner) -> None:
+    layer = descent.layer("mass", ("initial_state", "terminal_time"))
+    x = states(descent, 4)
+    with torch.no_grad():
+        x[2, 0] = -100.0  # below ground
+        x[3, 6] = torch.nan
+    t = torch.tensor([33.0, 25.0, 33.0, 33.0], dtype=torch.float64, requires_grad=True)
+    loss = layer(initial_state=x, terminal_time=t)
+    assert torch.isnan(loss).tolist() == [False, True, True, True]
+    loss.square().nansum().backward()
+    assert x.grad is not None
+    assert torch.all(torch.isfinite(x.grad))
+    assert torch.all(x.grad[1:] == 0.0)
+    assert torch.any(x.grad[0] != 0.0)
+    good, infeasible, below, bad = layer.samples
+    assert good.usable
+    assert good.trusted
+    assert infeasible.status is ScpStatus.INFEASIBLE
+    assert below.message.startswith("x: got -100")
+    assert "initial_mass" in bad.message
+    for sample in (infeasible, below, bad):
+        assert not sample.usable
+        assert sample.trusted is False
+        assert sample.reasons[0].startswith("zero gradient: ")
+
+
+def test_a_network_learns_through_it(small: Planner) -> None:
+    torch.manual_seed(0)
+    network = torch.nn.Linear(2, 1).double()
+    layer = small.layer("cost", ("initial_state", "terminal_time"))
+    start = torch.tensor([[0.0, 0.0], [0.1, 0.0]], dtype=torch.float64)
+    optimiser = torch.optim.Adam(network.parameters(), lr=0.1)
+    losses = []
+    for _ in range(5):
+        optimiser.zero_grad()
+        seconds = 1.5 + torch.nn.functional.softplus(network(start)[:, 0])
+        loss = layer(initial_state=start, terminal_time=seconds).mean()
+        loss.backward()
+        optimiser.step()
+        losses.append(float(loss.detach()))
+    assert losses[-1] < losses[0]
+
+
+def test_inputs_are_checked(descent: Planner) -> None:
+    with pytest.raises(InvalidInputError, match="each given once"):
+        descent.layer("cost", ("initial_state", "initial_mass"))
+    with pytest.raises(InvalidInputError, match="each given once"):
+        descent.layer("cost", ())
+    with pytest.raises(InvalidInputError, match="did you mean"):
+        descent.layer("cost", ("inital_mass",))
+    free = Planner(descent.problem, PlannerSettings(intervals=20, terminal_time=TerminalTime.FREE))
+    with pytest.raises(InvalidInputError, match="a decision of the solver"):
+        free.layer("cost", ("terminal_time",))
+    layer = descent.layer("cost", ("initial_state",))
+    with pytest.raises(InvalidInputError, match="exactly"):
+        layer(terminal_time=torch.zeros(1))
+    with pytest.raises(InvalidInputError, match="shape"):
+        layer(initial_state=torch.zeros(2, 3))
+
+
+def test_a_problem_without_named_initial_state_says_so() -> None:
+    with pytest.raises(InvalidInputError, match="initial_state"):
+        Planner(cart()).layer("cost", ("initial_state",))
