@@ -16,7 +16,7 @@ from dscp_core.planning.plan import Plan, PlanOutcome, PlanStatus
 from dscp_core.planning.planner import Planner
 from dscp_core.problem.declaration import OptimalControlProblem, named
 from dscp_core.transcription.compiled import CompiledFunction
-from dscp_ros.planner.interfaces import VEHICLE_PREFIX
+from dscp_ros.planner.declaration import VEHICLE_PREFIX
 from dscp_ros.planner.parameters import node_settings, parameter_table
 
 Array = NDArray[np.float64]

@@ -29,18 +29,15 @@ from std_msgs.msg import String
 
 from dscp_core import problems
 from dscp_core.planning.plan import PlanStatus
-from dscp_core.planning.planner import Planner, PlannerSettings, TerminalTime
+from dscp_core.planning.planner import PlannerSettings, TerminalTime
+from dscp_core.problems.powered_descent.messages import LANDING_FRAME, message_from_core
+from dscp_core.problems.powered_descent.scene import quaternion_from_z_axis
 from dscp_core.problems.powered_descent.simulation import DescentRecord, Replan, simulate_descent
 from dscp_ros.bag import BagWriter
 from msg_adapters.errors import InputCode
-from msg_adapters.frames import (
-    Array,
-    StateLayout,
-    quaternion_from_z_axis,
-    ros_from_core,
-    state_layout,
-)
+from msg_adapters.frames import Array
 from msg_adapters.joint_state import joint_state_from_state
+from msg_adapters.layout import StateLayout, problem_layout
 from msg_adapters.mass import inertia_from_mass
 from msg_adapters.odometry import odometry_from_kinematics
 from msg_adapters.stamps import (
@@ -126,15 +123,17 @@ def _nominal_entries(record: DescentRecord) -> Iterable[_Entry]:
         mass = inertia_from_mass(StampedMass(stamp_ns, float(measured[6])))
         yield _Entry(at(time_s + MASS_LATENCY_S), MASS_TOPIC, mass)
         kinematics = Kinematics(
-            stamp_ns, ros_from_core(measured[0:3]), ros_from_core(measured[3:6])
+            stamp_ns, message_from_core(measured[0:3]), message_from_core(measured[3:6])
         )
-        odometry = odometry_from_kinematics(kinematics, attitude=_attitude(thrust))
+        odometry = odometry_from_kinematics(
+            kinematics, frame=LANDING_FRAME, attitude=_attitude(thrust)
+        )
         yield _Entry(at(time_s + STATE_LATENCY_S), STATE_TOPIC, odometry)
 
 
 def _attitude(thrust: Array) -> Array:
     """Quaternion (x, y, z, w) of a body whose +z axis points along the thrust (core axes)."""
-    tilt = Rotation.from_quat(quaternion_from_z_axis(ros_from_core(thrust)))
+    tilt = Rotation.from_quat(quaternion_from_z_axis(message_from_core(thrust)))
     heading = Rotation.from_rotvec([0.0, 0.0, HEADING_RAD])
     return np.asarray((tilt * heading).as_quat())
 
@@ -210,9 +209,7 @@ FAULTS: dict[int, Fault] = {
 def write_dispersed(folder: Path) -> Path:
     """Writes a series of unrelated initial states, some of them bad; returns the bag."""
     random = np.random.default_rng(DISPERSED_SEED)
-    layout = state_layout(
-        "powered_descent", Planner(problems.get("powered_descent"), PlannerSettings()).state_names
-    )
+    layout = problem_layout(problems.get("powered_descent"))
     bag = folder / DISPERSED
     with BagWriter(bag, overwrite=True) as writer:
         opening = f"{DISPERSED_STATES} unrelated initial states, seed {DISPERSED_SEED}"
@@ -232,9 +229,7 @@ def write_dispersed(folder: Path) -> Path:
 
 def write_ignitions(folder: Path) -> list[Path]:
     """Writes two series of unrelated states, in each of which the engine is lit."""
-    layout = state_layout(
-        "powered_descent", Planner(problems.get("powered_descent"), PlannerSettings()).state_names
-    )
+    layout = problem_layout(problems.get("powered_descent"))
     bags = []
     for number, (name, seed) in enumerate(IGNITIONS_SEEDS.items()):
         random = np.random.default_rng(seed)

@@ -28,8 +28,8 @@ from dscp_core import problems
 from dscp_core.planning.plan import PlanOutcome
 from dscp_ros.bag import BagWriter
 from msg_adapters.errors import InputCode
-from msg_adapters.frames import PLANET_FRAME, StateLayout, state_layout
 from msg_adapters.joint_state import joint_state_from_state
+from msg_adapters.layout import StateLayout, problem_layout
 from msg_adapters.stamps import nanoseconds_from_seconds, stamp_from_nanoseconds
 from msg_adapters.state import StampedState
 
@@ -166,11 +166,11 @@ def write_dispersed(folder: Path) -> Path:
 
 
 def _layout() -> StateLayout:
-    return state_layout("entry", [state.name for state in problems.get("entry").states])
+    return problem_layout(problems.get("entry"))
 
 
 def _message(state: StampedState, layout: StateLayout) -> JointState:
-    return joint_state_from_state(state, layout, frame=PLANET_FRAME)
+    return joint_state_from_state(state, layout)
 
 
 if __name__ == "__main__":

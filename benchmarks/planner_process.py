@@ -30,8 +30,8 @@ from trajectory_msgs.msg import JointTrajectory
 
 from benchmarks.cases import Array
 from dscp_core.problems import get
-from dscp_ros.planner.parameters import problem_layout
 from msg_adapters.joint_state import joint_state_from_state
+from msg_adapters.layout import problem_layout
 from msg_adapters.report_message import report_from_message
 from msg_adapters.stamps import nanoseconds_from_stamp
 from msg_adapters.state import StampedState

@@ -2,8 +2,8 @@
 
 Conventions:
 
-- ROS positions and velocities are in a z-up landing frame (REP 103; ``landing_site`` unless told
-  otherwise). The core's first axis is up. `frames` holds the mapping between the two.
+- Names, order, axes and frame of a problem's state in messages are what the problem says of them
+  (`dscp_core.problem.messages`); `layout` holds the mapping.
 - SI units. Every number written into a message is converted by ``float()`` or ``int()``, because
   rclpy does not check field types unless ``ROS_PYTHON_CHECK_FIELDS=1`` is set.
 - Whatever is refused raises `errors.RejectedInputError`, with a numbered `errors.InputCode`, the

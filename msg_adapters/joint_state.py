@@ -8,17 +8,17 @@ import numpy as np
 from sensor_msgs.msg import JointState
 
 from msg_adapters.checks import require_finite, require_frame, require_length, require_names
-from msg_adapters.frames import LANDING_FRAME, StateLayout
-from msg_adapters.limits import default_limits
+from msg_adapters.layout import StateLayout
+from msg_adapters.limits import StateLimits, admitted
 from msg_adapters.stamps import nanoseconds_from_stamp, stamp_from_nanoseconds
-from msg_adapters.state import StampedState, StateLimits
+from msg_adapters.state import StampedState
 
 
 def state_from_joint_state(
     message: JointState,
     layout: StateLayout,
     *,
-    frame: str = LANDING_FRAME,
+    frame: str | None = None,
     limits: StateLimits | None = None,
 ) -> StampedState:
     """State whose entries are ``position[i]`` of ``name[i]``, in any order.
@@ -27,32 +27,31 @@ def state_from_joint_state(
         message: The message; ``velocity`` and ``effort`` are not used, but their length has to be
             zero or that of ``name``.
         layout: Names and order of the problem's state.
-        frame: Expected ``header.frame_id``.
-        limits: Range limits; the defaults of the problem if None.
+        frame: Expected ``header.frame_id``; that of the layout if None.
+        limits: Range limits; those of the layout if None.
 
     Raises:
         RejectedInputError: NOT_FINITE, EMPTY_FRAME, WRONG_FRAME, WRONG_ARRAY_LENGTH,
             DUPLICATE_NAME, UNKNOWN_NAME, MISSING_NAME, OUT_OF_RANGE, BELOW_GROUND,
             MASS_NOT_POSITIVE or INVALID_STAMP, checked in this order.
     """
-    limits = limits or default_limits(layout.problem)
     require_finite((f"position[{index}]", value) for index, value in enumerate(message.position))
-    require_frame("header.frame_id", message.header.frame_id, frame)
+    require_frame("header.frame_id", message.header.frame_id, frame or layout.frame)
     require_length("position", len(message.position), len(message.name))
     require_length("velocity", len(message.velocity), len(message.name), empty_allowed=True)
     require_length("effort", len(message.effort), len(message.name), empty_allowed=True)
     require_names("name", message.name, layout.message_names)
     named = {name: float(v) for name, v in zip(message.name, message.position, strict=True)}
-    admitted = limits.admit(named)
+    passed = admitted(limits or layout.limits, named)
     stamp_ns = nanoseconds_from_stamp(message.header.stamp)
-    ordered = np.array([admitted[name] for name in layout.message_names], dtype=np.float64)
+    ordered = np.array([passed[name] for name in layout.message_names], dtype=np.float64)
     return StampedState(stamp_ns, layout.to_core_order(ordered))
 
 
 def joint_state_from_state(
-    state: StampedState, layout: StateLayout, *, frame: str = LANDING_FRAME
+    state: StampedState, layout: StateLayout, *, frame: str | None = None
 ) -> JointState:
-    """Message of a state, in message order.
+    """Message of a state, in message order; in the layout's frame if none is given.
 
     Raises:
         RejectedInputError: NOT_FINITE.
@@ -63,7 +62,7 @@ def joint_state_from_state(
     )
     message = JointState()
     message.header.stamp = stamp_from_nanoseconds(state.stamp_ns)
-    message.header.frame_id = frame
+    message.header.frame_id = frame or layout.frame
     message.name = list(layout.message_names)
     message.position = array.array("d", ordered.tolist())
     return message

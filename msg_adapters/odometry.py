@@ -1,14 +1,19 @@
-"""nav_msgs/Odometry: position and velocity of a landing vehicle."""
+"""nav_msgs/Odometry: position and velocity of a vehicle."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 from nav_msgs.msg import Odometry
 
 from msg_adapters.checks import require_finite, require_frame
-from msg_adapters.frames import BODY_FRAME, LANDING_FRAME, Array, rotate, unit_quaternion
+from msg_adapters.errors import RejectedInputError
+from msg_adapters.frames import BODY_FRAME, Array, rotate, unit_quaternion
+from msg_adapters.layout import StateLayout
+from msg_adapters.limits import StateLimits, admitted
 from msg_adapters.stamps import nanoseconds_from_stamp, stamp_from_nanoseconds
-from msg_adapters.state import InputLimits, Kinematics, check_position, check_velocity
+from msg_adapters.state import Kinematics
 
 _POSITION = "pose.pose.position"
 _ORIENTATION = "pose.pose.orientation"
@@ -16,23 +21,28 @@ _VELOCITY = "twist.twist.linear"
 
 
 def kinematics_from_odometry(
-    message: Odometry, *, frame: str = LANDING_FRAME, limits: InputLimits | None = None
+    message: Odometry,
+    layout: StateLayout,
+    *,
+    frame: str | None = None,
+    limits: StateLimits | None = None,
 ) -> Kinematics:
-    """Position and velocity in the landing frame.
+    """Position and velocity in the frame of states and plans.
 
     The message's twist is in ``child_frame_id``: it is rotated by the attitude, unless both frames
     are the same. Angular velocity and covariances are not used and not checked.
 
     Args:
         message: The message.
-        frame: Expected ``header.frame_id``.
-        limits: Range limits; the defaults of `InputLimits` if None.
+        layout: Of a problem with odometry.
+        frame: Expected ``header.frame_id``; that of the layout if None.
+        limits: Range limits; those of the layout if None.
 
     Raises:
         RejectedInputError: NOT_FINITE, EMPTY_FRAME, WRONG_FRAME, NON_UNIT_QUATERNION,
             OUT_OF_RANGE, BELOW_GROUND or INVALID_STAMP, checked in this order.
     """
-    limits = limits or InputLimits()
+    frame = frame or layout.frame
     point = message.pose.pose.position
     attitude = message.pose.pose.orientation
     linear = message.twist.twist.linear
@@ -50,32 +60,39 @@ def kinematics_from_odometry(
     require_frame("child_frame_id", message.child_frame_id)
     rotated = message.child_frame_id != frame
     unit = unit_quaternion(_ORIENTATION, quaternion) if rotated else None
-    check_position(_POSITION, position, limits)
-    check_velocity(_VELOCITY, velocity, limits)
-    stamp_ns = nanoseconds_from_stamp(message.header.stamp)
-
     body_velocity = np.array(velocity, dtype=np.float64)
-    return Kinematics(
-        stamp_ns=stamp_ns,
+    kinematics = Kinematics(
+        stamp_ns=0,
         position_m=np.array(position, dtype=np.float64),
         velocity_m_s=body_velocity if unit is None else rotate(unit, body_velocity),
     )
+    _check_range(kinematics, layout, limits or layout.limits)
+    return replace(kinematics, stamp_ns=nanoseconds_from_stamp(message.header.stamp))
+
+
+def _check_range(kinematics: Kinematics, layout: StateLayout, limits: StateLimits) -> None:
+    """Check the limits of what an odometry tells; an error has the message's own field names."""
+    try:
+        admitted(limits, kinematics.named(layout))
+    except RejectedInputError as error:
+        field = error.field.replace("position", _POSITION).replace("velocity", _VELOCITY)
+        raise RejectedInputError(error.code, field, error.value, error.bound) from None
 
 
 def odometry_from_kinematics(
     kinematics: Kinematics,
     *,
+    frame: str,
     attitude: Array | None = None,
-    frame: str = LANDING_FRAME,
     child_frame: str = BODY_FRAME,
 ) -> Odometry:
     """Message of a position and velocity.
 
     Args:
-        kinematics: In the landing frame.
-        attitude: Quaternion (x, y, z, w) that rotates body axes into landing-frame axes; identity
-            if None. The twist is written in body axes, unless the two frames are the same.
+        kinematics: In that frame.
         frame: ``header.frame_id``.
+        attitude: Quaternion (x, y, z, w) that rotates body axes into the frame's; identity if None.
+            The twist is written in body axes, unless the two frames are the same.
         child_frame: ``child_frame_id``.
 
     Raises:

@@ -1,7 +1,7 @@
-"""Problem parameters as ROS users give them: vectors in the landing frame, z up.
+"""Problem parameters as ROS users give them: in the axes and the order of messages.
 
-Scalars are the same on both sides. Of a landing problem's vectors, those of length 3 follow the
-axes and those as long as the state follow its order in messages.
+Scalars are the same on both sides. Vectors as long as the state follow its order in messages; those
+of length 3 follow the axes of messages, where the problem has such.
 """
 
 from __future__ import annotations
@@ -10,13 +10,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from msg_adapters.frames import (
-    POWERED_DESCENT,
-    Array,
-    StateLayout,
-    core_from_ros,
-    ros_from_core,
-)
+from msg_adapters.frames import Array
+from msg_adapters.layout import StateLayout
 
 
 def follows_message_axes(layout: StateLayout, values: Sequence[float]) -> bool:
@@ -31,7 +26,7 @@ def parameter_to_message_axes(layout: StateLayout, values: Sequence[float]) -> l
     if _follows_state(layout, array):
         array = layout.to_message_order(array)
     elif _follows_axes(layout, array):
-        array = ros_from_core(array)
+        array = layout.to_message_axes(array)
     return [float(value) for value in array]
 
 
@@ -41,7 +36,7 @@ def parameter_to_core_axes(layout: StateLayout, values: Sequence[float]) -> list
     if _follows_state(layout, array):
         array = layout.to_core_order(array)
     elif _follows_axes(layout, array):
-        array = core_from_ros(array)
+        array = layout.to_core_axes(array)
     return [float(value) for value in array]
 
 
@@ -50,4 +45,4 @@ def _follows_state(layout: StateLayout, array: Array) -> bool:
 
 
 def _follows_axes(layout: StateLayout, array: Array) -> bool:
-    return layout.problem == POWERED_DESCENT and array.shape == (3,)
+    return layout.axes is not None and array.shape == (3,)

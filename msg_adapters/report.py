@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+import re
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import TYPE_CHECKING
@@ -31,7 +32,7 @@ class CheckFigures:
     """One constraint of a certificate.
 
     Attributes:
-        name: Name of the constraint.
+        name: Name of the constraint or miss.
         worst_value: Worst value along the integrated trajectory, in ``unit``.
         bound: Value that it must not pass.
         unit: Unit of both.
@@ -54,17 +55,14 @@ class CertificateFigures:
     Attributes:
         passed: Whether the plan may be flown.
         reasons: Why not; empty if it passed.
-        miss_position_m: Distance from the target at the end.
-        miss_speed_m_s: Speed error at the end.
-        mass_used_kg: Mass burnt.
+        values: What a flight comes to, by name and unit: the misses of this problem, for example
+            ``miss_position_m``, and ``mass_used_kg`` where the state has a mass.
         checks: Every constraint.
     """
 
     passed: bool
     reasons: tuple[str, ...]
-    miss_position_m: float | None
-    miss_speed_m_s: float | None
-    mass_used_kg: float | None
+    values: Mapping[str, float] = field(default_factory=dict)
     checks: tuple[CheckFigures, ...] = ()
 
 
@@ -186,16 +184,21 @@ def attempt_from_outcome(outcome: PlanOutcome, deadline_s: float | None) -> Atte
     )
 
 
-def figures_from_certificate(certificate: PlanCertificate | None) -> CertificateFigures | None:
-    """Figures of a certificate."""
+def figures_from_certificate(
+    certificate: PlanCertificate | None, misses: Collection[str] = ()
+) -> CertificateFigures | None:
+    """Figures of a certificate.
+
+    Args:
+        certificate: The certificate, or None.
+        misses: Names of the checks that are misses.
+    """
     if certificate is None:
         return None
     return CertificateFigures(
         passed=bool(certificate.passed),
         reasons=tuple(certificate.reasons),
-        miss_position_m=_known(certificate.miss_position_m),
-        miss_speed_m_s=_known(certificate.miss_speed_m_s),
-        mass_used_kg=_known(certificate.mass_used_kg),
+        values=_values(certificate, misses),
         checks=tuple(
             CheckFigures(
                 name=check.name,
@@ -208,6 +211,23 @@ def figures_from_certificate(certificate: PlanCertificate | None) -> Certificate
             for check in certificate.checks
         ),
     )
+
+
+def _values(certificate: PlanCertificate, misses: Collection[str]) -> dict[str, float]:
+    """Misses and used mass by name and unit; those that are known."""
+    found = {
+        key_of(check.name, check.unit): _known(check.worst_value)
+        for check in certificate.checks
+        if check.name in misses
+    }
+    found["mass_used_kg"] = _known(certificate.mass_used_kg)
+    return {key: value for key, value in found.items() if value is not None}
+
+
+def key_of(name: str, unit: str) -> str:
+    """Name with its unit, for example ``miss_speed_m_s``; a pure number has none."""
+    words = re.findall(r"[A-Za-z0-9]+", "" if unit == "1" else unit)
+    return "_".join([name, *words])
 
 
 def _known(value: float | None, factor: float = 1.0) -> float | None:

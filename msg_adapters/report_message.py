@@ -9,15 +9,16 @@ One status per message. Keys without a known value are left out. Keys:
   ``virtual_control``, ``max_defect``, ``cost``, ``terminal_time_predicted_s``,
   ``terminal_time_used_s``, ``terminal_time_source``, ``terminal_time_reason``, ``warm_started``,
   ``solver``
-- with a certificate: ``certificate.passed``, ``certificate.reason.K``,
-  ``certificate.miss_position_m``, ``certificate.miss_speed_m_s``, ``certificate.mass_used_kg``,
+- with a certificate: ``certificate.passed``, ``certificate.reason.K``, ``certificate.NAME_UNIT``
+  of each miss of the problem (for a landing ``certificate.miss_position_m`` and
+  ``certificate.miss_speed_m_s``), ``certificate.mass_used_kg`` where the state has a mass,
   ``certificate.check.K.FIELD`` with the fields of `report.CheckFigures`
 - after a refusal: ``field``, ``value``, ``bound``
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from itertools import count
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
@@ -43,6 +44,8 @@ from msg_adapters.stamps import (
 _CERTIFIED = 0
 _SOLVER_FAILURE = 5
 _STATE = "state."
+_CERTIFICATE = "certificate."
+_PASSED = "certificate.passed"
 _REASON = "certificate.reason."
 _CHECK = "certificate.check."
 _NUMBERS = (
@@ -55,7 +58,6 @@ _NUMBERS = (
     "terminal_time_predicted_s",
     "terminal_time_used_s",
 )
-_CERTIFICATE_NUMBERS = ("miss_position_m", "miss_speed_m_s", "mass_used_kg")
 _CHECK_NUMBERS = ("worst_value", "bound", "time_s")
 
 
@@ -75,7 +77,7 @@ def message_from_report(report: PlanReport, *, node: str, frame: str) -> Diagnos
     Args:
         report: The report.
         node: Name of the node; the status is called ``NODE: report``.
-        frame: ``header.frame_id``, the landing frame.
+        frame: ``header.frame_id``, that of states and plans.
     """
     message = DiagnosticArray()
     message.header.stamp = stamp_from_nanoseconds(report.stamp_ns)
@@ -123,11 +125,12 @@ def _pairs(report: PlanReport) -> Iterator[tuple[str, Value]]:
 
 
 def _certificate_pairs(certificate: CertificateFigures) -> Iterator[tuple[str, Value]]:
-    yield "certificate.passed", certificate.passed
+    yield _PASSED, certificate.passed
     for k, reason in enumerate(certificate.reasons):
         yield f"{_REASON}{k}", reason
-    for key in _CERTIFICATE_NUMBERS:
-        yield f"certificate.{key}", getattr(certificate, key)
+    for key, value in certificate.values.items():
+        if not _is_of_certificate_itself(_CERTIFICATE + key):  # else it is among the checks only
+            yield _CERTIFICATE + key, float(value)
     for k, check in enumerate(certificate.checks):
         prefix = f"{_CHECK}{k}."
         yield prefix + "name", check.name
@@ -161,7 +164,7 @@ def report_from_message(message: DiagnosticArray) -> PlanReport:
         latency_ms=reader.optional_number("latency_ms"),
         mass_source=reader.optional_text("mass_source"),
         parameter_set=reader.optional_text("parameter_set"),
-        state=_state(reader),
+        state=_named_numbers(reader, _STATE, reader.texts),
         attempt=_attempt(reader),
         certificate=_certificate(reader),
         rejection=_rejection(reader),
@@ -180,13 +183,14 @@ def _input_stamp_ns(reader: KeyValueReader) -> int | None:
         ) from None
 
 
-def _state(reader: KeyValueReader) -> dict[str, float]:
-    state = {}
-    for key in reader.texts:
-        value = reader.optional_number(key) if key.startswith(_STATE) else None
+def _named_numbers(reader: KeyValueReader, prefix: str, keys: Iterable[str]) -> dict[str, float]:
+    """Numbers of those of the keys that begin so, by what follows."""
+    numbers = {}
+    for key in keys:
+        value = reader.optional_number(key) if key.startswith(prefix) else None
         if value is not None:
-            state[key.removeprefix(_STATE)] = value
-    return state
+            numbers[key.removeprefix(prefix)] = value
+    return numbers
 
 
 def _attempt(reader: KeyValueReader) -> AttemptFigures | None:
@@ -203,17 +207,25 @@ def _attempt(reader: KeyValueReader) -> AttemptFigures | None:
 
 
 def _certificate(reader: KeyValueReader) -> CertificateFigures | None:
-    if reader.optional_text("certificate.passed") is None:
+    if reader.optional_text(_PASSED) is None:
         return None
     reasons: list[str] = []
     while (reason := reader.optional_text(f"{_REASON}{len(reasons)}")) is not None:
         reasons.append(reason)
     return CertificateFigures(
-        passed=reader.boolean("certificate.passed"),
+        passed=reader.boolean(_PASSED),
         reasons=tuple(reasons),
+        values=_named_numbers(
+            reader,
+            _CERTIFICATE,
+            [key for key in reader.texts if not _is_of_certificate_itself(key)],
+        ),
         checks=tuple(_checks(reader)),
-        **{key: reader.optional_number(f"certificate.{key}") for key in _CERTIFICATE_NUMBERS},
     )
+
+
+def _is_of_certificate_itself(key: str) -> bool:
+    return key == _PASSED or key.startswith((_REASON, _CHECK))
 
 
 def _checks(reader: KeyValueReader) -> Iterator[CheckFigures]:

@@ -1,17 +1,18 @@
 """trajectory_msgs/JointTrajectory: a plan as a trajectory of named scalars.
 
 Per point, in message order: ``positions`` are the states, ``velocities`` their rates of change.
-Controls stand at the states they act on. Forces are in ``effort``, zero elsewhere (for powered
-descent the thrust in newtons at vx, vy, vz). Controls that are rates of states (for entry those of
-angle_of_attack and bank_angle in rad/s) are what ``velocities`` holds for these states, and
-``effort`` stays empty. So do ``accelerations``. The header's stamp is that of the state the plan
-starts from, so ``time_from_start`` counts from there.
+Controls stand in one of three forms (`msg_adapters.layout.ControlForm`). Those that act on a state
+each, as the problem declares by ``control_states``, stand there: in ``effort``, zero elsewhere (for
+a landing the thrust in newtons at vx, vy, vz), or, if they are the rates of these states, as what
+``velocities`` holds for them, and ``effort`` stays empty. All others have names of their own after
+those of the states, their values in ``positions`` and zero in ``velocities``; ``effort`` stays
+empty. So do ``accelerations``. The header's stamp is that of the state the plan starts from, so
+``time_from_start`` counts from there.
 """
 
 from __future__ import annotations
 
 import array
-from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -19,7 +20,8 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from msg_adapters.checks import require_finite, require_frame, require_length, require_names
 from msg_adapters.errors import InputCode, RejectedInputError
-from msg_adapters.frames import LANDING_FRAME, Array, ControlField, StateLayout
+from msg_adapters.frames import Array
+from msg_adapters.layout import ControlForm, StateLayout
 from msg_adapters.stamps import (
     duration_from_nanoseconds,
     nanoseconds_from_duration,
@@ -40,20 +42,20 @@ class TrajectoryEncoder:
     first. Not safe for use by several threads at once.
     """
 
-    def __init__(self, layout: StateLayout, nodes: int, *, frame: str = LANDING_FRAME) -> None:
+    def __init__(self, layout: StateLayout, nodes: int, *, frame: str | None = None) -> None:
         """Preallocate.
 
         Args:
             layout: Names and order of the state.
             nodes: Number of trajectory points.
-            frame: ``header.frame_id``.
+            frame: ``header.frame_id``; that of the layout if None.
         """
         self._layout = layout
         self._fields = _fields(layout)
-        size = len(layout.message_names)
+        size = len(layout.joint_names)
         self._message = JointTrajectory()
-        self._message.header.frame_id = frame
-        self._message.joint_names = list(layout.message_names)
+        self._message.header.frame_id = frame or layout.frame
+        self._message.joint_names = list(layout.joint_names)
         self._message.points = [
             JointTrajectoryPoint(
                 **{field: array.array("d", bytes(8 * size)) for field in self._fields}
@@ -93,13 +95,7 @@ class TrajectoryEncoder:
                     InputCode.NOT_FINITE, f"plan.{field}", "NaN or infinity", "finite"
                 )
         self._message.header.stamp = stamp_from_nanoseconds(stamp_ns)
-        contents = {
-            "positions": plan.states,
-            "velocities": plan.state_rates.copy(),
-            "effort": np.zeros_like(plan.states),
-        }
-        contents[self._layout.control_field.value][:, list(plan.control_states)] = plan.controls
-        blocks = [self._layout.to_message_order(contents[field]) for field in self._fields]
+        blocks = self._blocks(plan)
         for k, (point, views) in enumerate(zip(self._message.points, self._views, strict=True)):
             for view, block in zip(views, blocks, strict=True):
                 view[:] = block[k]
@@ -107,9 +103,25 @@ class TrajectoryEncoder:
             point.time_from_start = duration_from_nanoseconds(nanoseconds)
         return self._message
 
+    def _blocks(self, plan: Plan) -> list[Array]:
+        """What each field holds, (N+1, names)."""
+        layout = self._layout
+        contents = {
+            "positions": plan.states,
+            "velocities": plan.state_rates.copy(),
+            "effort": np.zeros_like(plan.states),
+        }
+        if layout.control_form is not ControlForm.NAMED:
+            contents[layout.control_form.value][:, list(layout.control_states)] = plan.controls
+        blocks = [layout.to_message_order(contents[field]) for field in self._fields]
+        if layout.control_form is ControlForm.NAMED:
+            own = (plan.controls, np.zeros_like(plan.controls))
+            blocks = [np.hstack(pair) for pair in zip(blocks, own, strict=True)]
+        return blocks
+
 
 def trajectory_from_plan(
-    plan: Plan, stamp_ns: int, layout: StateLayout, *, frame: str = LANDING_FRAME
+    plan: Plan, stamp_ns: int, layout: StateLayout, *, frame: str | None = None
 ) -> JointTrajectory:
     """A new message of one plan; `TrajectoryEncoder` is faster for many.
 
@@ -120,12 +132,7 @@ def trajectory_from_plan(
 
 
 def plan_from_trajectory(
-    message: JointTrajectory,
-    layout: StateLayout,
-    *,
-    control_names: Sequence[str],
-    control_states: Sequence[int],
-    frame: str = LANDING_FRAME,
+    message: JointTrajectory, layout: StateLayout, *, frame: str | None = None
 ) -> tuple[Plan, int]:
     """Plan and start time of a message, whatever the order of its names.
 
@@ -134,9 +141,7 @@ def plan_from_trajectory(
     Args:
         message: The message.
         layout: Names and order of the problem's state.
-        control_names: Names of the core's controls.
-        control_states: Index of the core state that each control acts on.
-        frame: Expected ``header.frame_id``.
+        frame: Expected ``header.frame_id``; that of the layout if None.
 
     Returns:
         The plan, and the stamp of its start in nanoseconds.
@@ -151,9 +156,9 @@ def plan_from_trajectory(
         for field in ("positions", "velocities", "effort"):
             values = getattr(point, field)
             require_finite((f"points[{k}].{field}[{i}]", v) for i, v in enumerate(values))
-    require_frame("header.frame_id", message.header.frame_id, frame)
-    require_names("joint_names", message.joint_names, layout.message_names)
-    size = len(layout.message_names)
+    require_frame("header.frame_id", message.header.frame_id, frame or layout.frame)
+    require_names("joint_names", message.joint_names, layout.joint_names)
+    size = len(layout.joint_names)
     filled = _fields(layout)
     for k, point in enumerate(message.points):
         for field in ("positions", "velocities", "effort"):
@@ -162,21 +167,29 @@ def plan_from_trajectory(
     times_s = _times_s(message)
     stamp_ns = nanoseconds_from_stamp(message.header.stamp)
 
-    columns = [list(message.joint_names).index(name) for name in layout.message_names]
+    columns = [list(message.joint_names).index(name) for name in layout.joint_names]
+    states = len(layout.message_names)
 
-    def in_core_order(field: str) -> Array:
+    def table(field: str) -> Array:
         rows = np.array([getattr(p, field) for p in message.points], dtype=np.float64)
-        return layout.to_core_order(rows[:, columns])
+        return rows[:, columns]
 
+    def of_states(field: str) -> Array:
+        return layout.to_core_order(table(field)[:, :states])
+
+    if layout.control_form is ControlForm.NAMED:
+        controls = table("positions")[:, states:]
+    else:
+        controls = of_states(layout.control_form.value)[:, list(layout.control_states)]
     plan = Plan(
         problem=layout.problem,
         state_names=layout.state_names,
-        control_names=tuple(control_names),
-        control_states=tuple(control_states),
+        control_names=layout.control_names,
+        control_states=layout.control_states,
         times_s=times_s,
-        states=in_core_order("positions"),
-        controls=in_core_order(layout.control_field.value)[:, list(control_states)],
-        state_rates=in_core_order("velocities"),
+        states=of_states("positions"),
+        controls=controls,
+        state_rates=of_states("velocities"),
         terminal_time_s=float(times_s[-1]),
     )
     return plan, stamp_ns
@@ -184,7 +197,7 @@ def plan_from_trajectory(
 
 def _fields(layout: StateLayout) -> tuple[str, ...]:
     """Fields of a point that hold numbers."""
-    with_forces = layout.control_field is ControlField.EFFORT
+    with_forces = layout.control_form is ControlForm.EFFORT
     return ("positions", "velocities", "effort") if with_forces else ("positions", "velocities")
 
 

@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import numpy as np
+from nav_msgs.msg import Path
 
+from dscp_core import problems
 from dscp_core.planning.plan import Plan
-from msg_adapters.frames import StateLayout, state_layout
+from dscp_core.problems.powered_descent.messages import LANDING_FRAME
+from msg_adapters.frames import Array, rotate
+from msg_adapters.layout import StateLayout, problem_layout
+from msg_adapters.path import poses_from_path
 
 STATE_NAMES = ("x", "y", "z", "vx", "vy", "vz", "mass")
 CONTROL_NAMES = ("thrust_x", "thrust_y", "thrust_z")
 CONTROL_STATES = (3, 4, 5)
 STAMP_NS = 12_000_000_345
-LAYOUT: StateLayout = state_layout("powered_descent", STATE_NAMES)
+LAYOUT: StateLayout = problem_layout(problems.get("powered_descent"))
 
 
 def example_plan(nodes: int = 6) -> Plan:
@@ -36,3 +41,10 @@ def example_plan(nodes: int = 6) -> Plan:
         state_rates=np.hstack([velocities, ones * acceleration, -3.0 * ones]),
         terminal_time_s=float(times[-1]),
     )
+
+
+def points_from_path(message: Path, *, frame: str = LANDING_FRAME) -> tuple[Array, Array]:
+    """Positions and thrust directions of a landing's path, both (N+1, 3) in the landing frame."""
+    positions, attitudes = poses_from_path(message, frame=frame)
+    up = np.array([0.0, 0.0, 1.0])
+    return positions, np.array([rotate(attitude, up) for attitude in attitudes]).reshape(-1, 3)

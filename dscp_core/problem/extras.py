@@ -6,9 +6,12 @@ time that is free or given, named scalars in messages, no markers.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
+
+from dscp_core.problem.messages import Messages
+from dscp_core.problem.scene import SceneOf
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -47,7 +50,11 @@ class Extras:
     Attributes:
         figure: Its own figure of a plan.
         network: File of the terminal-time network of the default vehicle.
+        messages: How states and plans are told of in messages.
+        scene: Its plans in space; None for none.
     """
 
     figure: PlanFigure | None = None
     network: Path | None = None
+    messages: Messages = field(default_factory=Messages)
+    scene: SceneOf | None = None

@@ -25,8 +25,9 @@ every plan through all of its iterations, and moves the parameters of --paramete
 result is judged on states that were held out, and written as a parameter set: a directory whose
 parameters.yaml the node takes by --params-file.
 
-States are those of ~/vehicle_state, of ~/state with ~/mass, and those that ~/report tells of. They
-pass the node's own checks first. A damaged log is read as far as it goes.
+States are those of ~/vehicle_state, of ~/state with ~/mass where the problem takes odometry, and
+those that ~/report tells of. They pass the node's own checks first. A damaged log is read as far as
+it goes.
 
 --parameters NAME[.COMPONENT][=LOWER:UPPER][@START],...
   network                     weights of the network that predicts the terminal time
@@ -89,7 +90,11 @@ def _add_start(group: argparse._ArgumentGroup) -> None:
         help="the node's parameter file with vehicle and settings to start from, or that of a "
         "parameter set; may be repeated, later ones win",
     )
-    group.add_argument("--problem", metavar="NAME", help="problem (default: the node's)")
+    group.add_argument(
+        "--problem",
+        metavar="PROBLEM",
+        help="a known name, or FILE.py:NAME (default: the node's)",
+    )
     group.add_argument(
         "--network",
         type=Path,
@@ -139,9 +144,9 @@ def _add_states(group: argparse._ArgumentGroup) -> None:
 def _add_method(group: argparse._ArgumentGroup) -> None:
     group.add_argument(
         "--loss",
-        default="fuel",
         metavar="NAME",
-        help="fuel (default), cost, convergence, iterations, miss, or FILE.py:FUNCTION",
+        help="fuel (default where the state has a mass), cost (default elsewhere), convergence, "
+        "iterations, miss, or FILE.py:FUNCTION",
     )
     group.add_argument("--optimiser", default="adam", metavar="NAME", help="adam (default), lbfgs")
     group.add_argument(
@@ -202,8 +207,8 @@ def run(args: argparse.Namespace) -> int:
     from dscp_ros.tuning.logs import topics_of_node
 
     check_target(args.output, overwrite=args.overwrite)
-    topics = topics_of_node(args.node, _renamed(args.topic))
     start = _start(args)
+    topics = topics_of_node(args.node, _renamed(args.topic), start.layout)
     settings = _settings(args, start)
     gathered = gather(_gathering(args, topics), start, settings, _warn)
     if not args.json:
@@ -273,7 +278,7 @@ def _settings(args: argparse.Namespace, start: Start) -> TuningSettings:
         planner=start.values.planner,
         tuned=tuned,
         output=output.with_name(f"{output.name}.tuning"),
-        loss=args.loss,
+        loss=_loss(args.loss, start),
         optimiser=args.optimiser,
         epochs=args.epochs,
         learning_rate=args.learning_rate,
@@ -286,6 +291,22 @@ def _settings(args: argparse.Namespace, start: Start) -> TuningSettings:
         resume=args.resume,
         show_progress=not args.json,
     )
+
+
+def _loss(name: str | None, start: Start) -> str:
+    """The loss that was asked for, or the one that suits the problem.
+
+    Raises:
+        InvalidInputError: Fuel, of a problem without a mass.
+    """
+    from dscp_core.tuning.choice import COST, FUEL, LossChoice
+
+    problem = start.values.problem
+    has_fuel = LossChoice(FUEL).is_fuel(problem)
+    if name == FUEL and not has_fuel:
+        states = ", ".join(state.name for state in problem.states)
+        raise InvalidInputError("--loss", name, f"a state called mass; {problem.name} has {states}")
+    return name or (FUEL if has_fuel else COST)
 
 
 def _gathering(args: argparse.Namespace, topics: dict[str, str]) -> GatheringOptions:
@@ -309,7 +330,7 @@ def _save(
     """Writes the set; returns its name and identifier."""
     from dscp_ros.parameter_set import save
     from dscp_ros.tuning.outcome import set_values
-    from dscp_ros.tuning.sources import code_version
+    from dscp_ros.tuning.sources import code_version, problem_source
 
     provenance = {
         "made_by": {
@@ -319,6 +340,7 @@ def _save(
         },
         "options": {k: _plain(v) for k, v in vars(args).items() if k not in _NO_OPTIONS},
         "start": start.origin,
+        "problem_source": problem_source(start.values.choice),
         "tuned": [tuned_document(parameter) for parameter in settings.tuned],
         "logs": gathered.document(),
         "held_out_rule": gathered.split.rule,
@@ -329,6 +351,7 @@ def _save(
         set_values(start.values, result.values),
         start.network if result.network is None else result.network,
         json_ready(provenance),
+        choice=start.values.choice,
         overwrite=args.overwrite,
     ).label
 

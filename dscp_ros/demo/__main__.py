@@ -14,6 +14,7 @@ from types import FrameType
 from typing import NoReturn
 
 from dscp_core.errors import DscpError, InvalidInputError
+from dscp_core.problems import DEFAULT
 from dscp_ros.bag import BagError
 from dscp_ros.cli import ExitCode
 from dscp_ros.cli.output_files import complete_file
@@ -26,7 +27,6 @@ from dscp_ros.demo.cases import (
     DemoCase,
     shared,
 )
-from msg_adapters.frames import POWERED_DESCENT
 
 DESCRIPTION = """\
 Starts the planner node as a process of its own, replays recorded flights into it on real ROS 2
@@ -71,8 +71,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--problem",
         choices=tuple(CASES),
-        default=POWERED_DESCENT,
-        help=f"what the bags hold ({POWERED_DESCENT})",
+        default=DEFAULT,
+        help=f"what the bags hold ({DEFAULT})",
     )
     parser.add_argument(
         "--loop",

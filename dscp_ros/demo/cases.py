@@ -9,7 +9,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from dscp_core.errors import InvalidInputError
-from msg_adapters.frames import ENTRY, LANDING_FRAME, PLANET_FRAME, POWERED_DESCENT
+from dscp_core.problems.entry.definition import NAME as ENTRY
+from dscp_core.problems.entry.messages import PLANET_FRAME
+from dscp_core.problems.powered_descent.definition import NAME as POWERED_DESCENT
+from dscp_core.problems.powered_descent.messages import LANDING_FRAME
 
 _FOLDERS = (Path(__file__).parents[2], Path(sys.prefix) / "share" / "dscp_ros")
 """Where bags/ and config/ are: beside the packages in a checkout, or where they are installed."""

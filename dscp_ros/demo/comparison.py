@@ -7,6 +7,7 @@ import numpy as np
 from dscp_ros.demo.summary import Figures, attempt_rows, lines_of, parameter_set_lines
 
 _PREDICTED = "predicted"
+_MASS_USED = "mass_used_kg"
 
 
 def comparison(before: Figures, after: Figures) -> str:
@@ -32,9 +33,9 @@ def _fuel(before: Figures, after: Figures) -> list[str]:
     """Mean fuel over the states that have a certified plan in both."""
     burnt = [
         {
-            r.input_stamp_ns: r.certificate.mass_used_kg
+            r.input_stamp_ns: r.certificate.values[_MASS_USED]
             for r in part.attempts
-            if r.published and r.certificate is not None and r.certificate.mass_used_kg is not None
+            if r.published and r.certificate is not None and _MASS_USED in r.certificate.values
         }
         for part in (before, after)
     ]

@@ -14,7 +14,7 @@ from dscp_core.problem.declaration import OptimalControlProblem
 from dscp_ros.bag import BagReader
 from dscp_ros.demo.session import TRAJECTORY
 from dscp_ros.demo.summary import Figures
-from msg_adapters.frames import state_layout
+from msg_adapters.layout import problem_layout
 from msg_adapters.report import PlanReport
 from msg_adapters.stamps import nanoseconds_from_stamp
 from msg_adapters.trajectory import plan_from_trajectory
@@ -57,19 +57,13 @@ def recorded_plan(
     published = [[r for r in part.attempts if r.published] for part in parts]
     reports = {r.input_stamp_ns: r for r in next((p for p in reversed(published) if p), [])}
     problem = problems.get(problem_name)
-    layout = state_layout(problem.name, [state.name for state in problem.states])
+    layout = problem_layout(problem)
     with BagReader(recording) as reader:
         for _, message in reader.decoded_messages([TRAJECTORY]):
             report = reports.get(nanoseconds_from_stamp(message.header.stamp))
             if report is None:
                 continue
-            plan, _ = plan_from_trajectory(
-                message,
-                layout,
-                control_names=[control.name for control in problem.controls],
-                control_states=problem.control_states,
-                frame=frame,
-            )
+            plan, _ = plan_from_trajectory(message, layout, frame=frame)
             packed = problem.table.pack()
             verifier = PlanVerifier(problem, len(plan.times_s) - 1)
             certificate = verifier.certify(plan.times_s, plan.states, plan.controls, packed)

@@ -185,5 +185,5 @@ def _median_p99(values_ms: Sequence[float]) -> str:
 def _largest(figures: Figures, name: str) -> str:
     """Largest value of a figure of the certificates that passed."""
     certificates = (report.certificate for report in figures.attempts if report.published)
-    values = [getattr(c, name) for c in certificates if c is not None]
+    values = [c.values[name] for c in certificates if c is not None and name in c.values]
     return f"{max(values):.3f}" if values else "-"

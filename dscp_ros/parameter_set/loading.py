@@ -20,6 +20,7 @@ from dscp_ros.parameter_set.format import (
     read_provenance,
 )
 from dscp_ros.parameter_set.values import CheckedValues, read_values
+from dscp_ros.planner.choice import ProblemChoice
 from dscp_ros.planner.parameters import NETWORK
 
 _ATTEMPTS = 3
@@ -34,7 +35,7 @@ class ParameterSet:
         directory: Where it is.
         identifier: Short checksum of parameters and network.
         problem: Name of the problem.
-        formulation: Its formulation.
+        formulation: Its formulation; empty where there is one form only.
         values: Node parameters by flat name, as in the file.
         network: File of the terminal-time network, or None.
         terminal_time_network: The same, as it was when it was checked.
@@ -77,8 +78,13 @@ def directory_of(parameter_file: str | Path) -> Path | None:
     return None
 
 
-def load(directory: str | Path) -> ParameterSet:
+def load(directory: str | Path, choice: ProblemChoice | None = None) -> ParameterSet:
     """Read a set, as it is at one moment, even if another one takes its place meanwhile.
+
+    Args:
+        directory: Where it is.
+        choice: The problem of a set that does not name a known one: its problem is from a Python
+            file, which a set does not name.
 
     Raises:
         ParameterSetError: A file is missing, damaged, changed, or does not fit the others.
@@ -91,7 +97,7 @@ def load(directory: str | Path) -> ParameterSet:
             raise ParameterSetError(f"{directory}: no parameter set ({error.strerror})") from None
         try:
             # The path of the open directory goes on naming it when it is moved.
-            return _load(Path(f"/proc/self/fd/{handle}"), directory)
+            return _load(Path(f"/proc/self/fd/{handle}"), directory, choice)
         except ParameterSetError:
             if attempt == _ATTEMPTS or not _replaced(handle, directory):
                 raise
@@ -108,11 +114,11 @@ def _replaced(handle: int, directory: Path) -> bool:
         return True
 
 
-def _load(snapshot: Path, directory: Path) -> ParameterSet:
+def _load(snapshot: Path, directory: Path, choice: ProblemChoice | None) -> ParameterSet:
     try:
         provenance = read_provenance(snapshot / PROVENANCE_FILE)
         digests = _check_files(snapshot, provenance)
-        values = read_values(snapshot / PARAMETERS_FILE)
+        values = read_values(snapshot / PARAMETERS_FILE, choice)
         _check_agreement(snapshot, provenance, values)
         network = _network(snapshot, values) if NETWORK_FILE in digests else None
     except DscpError as error:

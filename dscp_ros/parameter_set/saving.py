@@ -25,7 +25,8 @@ from dscp_ros.parameter_set.format import (
 )
 from dscp_ros.parameter_set.loading import ParameterSet, load
 from dscp_ros.parameter_set.renaming import exchange
-from dscp_ros.parameter_set.values import check_values
+from dscp_ros.parameter_set.values import check_values, chosen_names
+from dscp_ros.planner.choice import ProblemChoice
 from dscp_ros.planner.parameters import NETWORK
 
 _FILES = frozenset({PARAMETERS_FILE, NETWORK_FILE, PROVENANCE_FILE})
@@ -37,6 +38,7 @@ def save(
     network: TerminalTimeNetwork | None = None,
     provenance: Mapping[str, Any] | None = None,
     *,
+    choice: ProblemChoice | None = None,
     overwrite: bool = False,
 ) -> ParameterSet:
     """Write a set; at any moment the old set, the new one or none is there, never a part.
@@ -49,6 +51,7 @@ def save(
             where there is a network.
         network: Terminal-time network of the set, or None.
         provenance: What it comes from, for JSON; format, problem, vehicle and checksums are added.
+        choice: The problem, where it is not the values that choose it.
         overwrite: Whether to replace a set that is there.
 
     Returns:
@@ -63,8 +66,8 @@ def save(
     given = {k: v for k, v in values.items() if k != NETWORK}
     if network is not None:
         given[NETWORK] = NETWORK_FILE
-    checked = check_values(given)
-    complete = {"problem": checked.problem.name, "formulation": checked.formulation, **given}
+    checked = check_values(given, choice)
+    complete = {**chosen_names(checked.choice, checked.formulation), **given}
     document = {
         **(provenance or {}),
         "format": FORMAT,
@@ -79,7 +82,7 @@ def save(
         prefix = f".{directory.name}.partial-"
         partial = Path(tempfile.mkdtemp(prefix=prefix, dir=directory.parent))
         _write(partial, complete, network, document)
-        load(partial)
+        load(partial, choice)
         _move_into_place(partial, directory, overwrite=overwrite)
     except (OSError, DscpError) as error:
         reason = (error.strerror if isinstance(error, OSError) else None) or str(error)
@@ -88,7 +91,7 @@ def save(
         # After an exchange this is the old set.
         if partial is not None and partial.exists():
             shutil.rmtree(partial)
-    return load(directory)
+    return load(directory, choice)
 
 
 def check_target(directory: Path, *, overwrite: bool) -> None:

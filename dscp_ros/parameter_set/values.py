@@ -7,15 +7,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from dscp_core import problems
+from dscp_core.errors import InvalidInputError
 from dscp_core.planning.planner import PlannerSettings
 from dscp_core.problem.declaration import OptimalControlProblem
+from dscp_ros.planner.choice import ProblemChoice, is_file
 from dscp_ros.planner.declaration import NodeParameter
 from dscp_ros.planner.parameter_files import check_parameter_names, read_file
 from dscp_ros.planner.parameters import (
+    FORMULATION,
     PROBLEM,
     NodeSettings,
-    formulation_parameter,
+    formulation_parameters,
     node_settings,
     parameter_table,
 )
@@ -29,13 +31,15 @@ class CheckedValues:
     """Values of a parameter file and what they mean.
 
     Attributes:
-        problem: The problem that they chose.
-        formulation: Its formulation.
+        choice: The problem that they chose.
+        problem: Its declaration.
+        formulation: Its formulation; empty where there is one form only.
         given: The values, by flat name.
         values: The same with the node's defaults where none is given.
         settings: Settings of the node that has them, the defaults elsewhere.
     """
 
+    choice: ProblemChoice
     problem: OptimalControlProblem
     formulation: str
     given: Mapping[str, Any]
@@ -58,32 +62,65 @@ class CheckedValues:
         return self.problem.vehicle_of(self.parameters)
 
 
-def read_values(path: Path) -> CheckedValues:
-    """Values of one parameter file.
+def read_values(path: Path, choice: ProblemChoice | None = None) -> CheckedValues:
+    """Values of the parameter file of a set.
+
+    Args:
+        path: The file.
+        choice: The problem where the file names none, as that of a problem from a Python file.
 
     Raises:
-        InvalidInputError: The file is unreadable, or a name, type or value is wrong.
+        InvalidInputError: The file is unreadable, a name, type or value is wrong, or it names a
+            Python file.
     """
-    return check_values(read_file(str(path), NODE))
+    given = read_file(str(path), NODE)
+    named = given.get(PROBLEM.name)
+    if named is None:
+        return check_values(given, choice)
+    refuse_file(named)
+    return check_values(given)
 
 
-def check_values(given: Mapping[str, Any]) -> CheckedValues:
+def refuse_file(problem: Any) -> None:
+    """Refuse data that name code to run.
+
+    Raises:
+        InvalidInputError: The name of a problem is that of a Python file.
+    """
+    if is_file(str(problem)):
+        raise InvalidInputError(
+            PROBLEM.name, problem, "a known name: a parameter set does not name a file to run"
+        )
+
+
+def check_values(given: Mapping[str, Any], choice: ProblemChoice | None = None) -> CheckedValues:
     """Check names, types, bounds, and what the problem makes of the values together.
 
     Args:
         given: Node parameters by flat name, in message axes.
+        choice: The problem, if it was chosen already; else the values do.
 
     Raises:
         InvalidInputError: A name, type or value is wrong.
     """
-    chosen = _checked(PROBLEM, given)
-    formulation = formulation_parameter(chosen)
-    problem = problems.get(chosen, _checked(formulation, given))
-    table = {p.name: p for p in (PROBLEM, formulation, *parameter_table(problem))}
+    choice = choice or ProblemChoice.read(_checked(PROBLEM, given))
+    forms = formulation_parameters(choice.family.formulations)
+    formulation = "".join(_checked(parameter, given) for parameter in forms)
+    problem = choice.make(formulation)
+    table = {p.name: p for p in (PROBLEM, *forms, *parameter_table(problem))}
     check_parameter_names(list(given), list(table))
     values = {name: _checked(parameter, given) for name, parameter in table.items()}
     settings = node_settings(problem, values)
-    return CheckedValues(problem, values[formulation.name], dict(given), values, settings)
+    return CheckedValues(choice, problem, formulation, dict(given), values, settings)
+
+
+def chosen_names(choice: ProblemChoice, formulation: str) -> dict[str, str]:
+    """Node parameters that say in a set which problem it is for.
+
+    A problem from a Python file is named where the set is used, never in the set.
+    """
+    names = {} if choice.is_file else {PROBLEM.name: choice.text}
+    return {**names, FORMULATION: formulation} if formulation else names
 
 
 def _checked(parameter: NodeParameter, given: Mapping[str, Any]) -> Any:

@@ -5,17 +5,18 @@ from __future__ import annotations
 import threading
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from concurrent.futures import Future
 from dataclasses import dataclass
 
-from dscp_core.planning.plan import PlanOutcome, PlanStatus
+from dscp_core.planning.plan import Plan, PlanOutcome, PlanStatus
 from dscp_ros.planner.health import HealthMonitor
 from dscp_ros.planner.input_checks import AcceptedState
 from dscp_ros.planner.outputs import PlanOutputs
 from dscp_ros.planner.parameters import NodeSettings
 from dscp_ros.planner.session import PlanningSession
-from msg_adapters.frames import StateLayout
+from msg_adapters.drawing import Drawing
+from msg_adapters.layout import StateLayout
 from msg_adapters.report import (
     NodeCode,
     PlanReport,
@@ -72,13 +73,24 @@ class AttemptRunner:
         health: HealthMonitor,
         layout: StateLayout,
         surroundings: Surroundings,
+        misses: Collection[str] = (),
     ) -> None:
-        """Start in epoch 0."""
+        """Start in epoch 0.
+
+        Args:
+            session: The planner.
+            outputs: Publishers.
+            health: Is told of every attempt.
+            layout: Names and order of the problem's state.
+            surroundings: What else an attempt needs.
+            misses: Names of the problem's misses.
+        """
         self._session = session
         self._outputs = outputs
         self._health = health
         self._layout = layout
         self._around = surroundings
+        self._misses = frozenset(misses)
         self._lock = threading.Lock()
         self._waiters: list[Future[PlanReport]] = []
         self._epoch = 0
@@ -130,10 +142,17 @@ class AttemptRunner:
             published = True
         latency_ms = 1e3 * (time.perf_counter() - job.arrived_s)
         if published and outcome.plan is not None:
-            self._outputs.publish_drawing(outcome.plan, state.stamp_ns, settings.markers)
+            self._draw(outcome.plan, state.stamp_ns, settings.drawing)
         else:
             self._around.log_warning(int(code), f"no plan: {code.name} ({int(code)}): {message}")
         return self._report(job, code, message, published, latency_ms, outcome)
+
+    def _draw(self, plan: Plan, stamp_ns: int, drawing: Drawing | None) -> None:
+        """Publish the drawing; a scene that fails costs the picture, not the plan's report."""
+        try:
+            self._outputs.publish_drawing(plan, stamp_ns, drawing)
+        except Exception as error:  # noqa: BLE001 - a problem's scene is anybody's code
+            self._around.log_error(f"no drawing: {type(error).__name__}: {error}")
 
     def _internal_error(self, job: PlanJob, error: Exception) -> PlanReport:
         self._session.forget()
@@ -159,7 +178,7 @@ class AttemptRunner:
         attempt = certificate = None
         if outcome is not None:
             attempt = attempt_from_outcome(outcome, self._around.settings().deadline_s)
-            certificate = figures_from_certificate(outcome.certificate)
+            certificate = figures_from_certificate(outcome.certificate, self._misses)
         return PlanReport(
             stamp_ns=self._around.now_ns(),
             source=job.source,

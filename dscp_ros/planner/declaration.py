@@ -12,6 +12,9 @@ from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescri
 
 from dscp_core.errors import InvalidInputError
 
+VEHICLE_PREFIX = "parameters."
+"""What the names of a problem's own parameters begin with."""
+
 Value = bool | int | float | str | Sequence[float]
 
 

@@ -14,8 +14,9 @@ from nav_msgs.msg import Odometry
 from sensor_msgs.msg import JointState
 
 from msg_adapters.errors import InputCode, RejectedInputError
-from msg_adapters.frames import LANDING_FRAME, StateLayout
 from msg_adapters.joint_state import state_from_joint_state
+from msg_adapters.layout import StateLayout
+from msg_adapters.limits import StateLimits
 from msg_adapters.mass import mass_from_inertia
 from msg_adapters.odometry import kinematics_from_odometry
 from msg_adapters.stamps import (
@@ -23,13 +24,7 @@ from msg_adapters.stamps import (
     seconds_from_nanoseconds,
     stamp_text,
 )
-from msg_adapters.state import (
-    InputLimits,
-    StampedMass,
-    StampedState,
-    StateLimits,
-    state_from_kinematics,
-)
+from msg_adapters.state import StampedMass, StampedState, state_from_kinematics
 
 FROM_MESSAGE = "message"
 FROM_PARAMETER = "parameter"
@@ -40,20 +35,20 @@ class InputSettings:
     """What inputs have to satisfy.
 
     Attributes:
-        frame: Frame of states.
+        frame: Frame of states; None for that of the problem.
         state_max_age_s: Largest age of a state.
         mass_max_age_s: Largest age of a mass message when a state needs it.
         future_tolerance_s: How far a stamp may be ahead of the clock.
         mass_fallback_kg: Mass to use without a fresh mass message; 0 for none.
-        limits: Range limits.
+        limits: Range limits; None for those of the problem's defaults.
     """
 
-    frame: str = LANDING_FRAME
+    frame: str | None = None
     state_max_age_s: float = 0.5
     mass_max_age_s: float = 2.0
     future_tolerance_s: float = 0.1
     mass_fallback_kg: float = 0.0
-    limits: StateLimits = InputLimits()  # noqa: RUF009 - frozen
+    limits: StateLimits | None = None
 
 
 @dataclass(frozen=True)
@@ -92,18 +87,23 @@ class InputGate:
     def accept_odometry(
         self, message: Odometry, now_ns: int, settings: InputSettings
     ) -> AcceptedState:
-        """Check an odometry and complete it with the mass.
+        """Check an odometry and complete it with the mass, if the state has one.
 
         Raises:
             RejectedInputError: Any code of 1xx to 7xx.
         """
-        limits = settings.limits
-        assert isinstance(limits, InputLimits)  # the node listens to odometry of landings only
-        kinematics = kinematics_from_odometry(message, frame=settings.frame, limits=limits)
+        odometry = self._layout.odometry
+        assert odometry is not None  # else nobody listens to it
+        kinematics = kinematics_from_odometry(
+            message, self._layout, frame=settings.frame, limits=settings.limits
+        )
         self._check_time("header.stamp", kinematics.stamp_ns, now_ns, settings)
-        mass_kg, source = self._mass_at(kinematics.stamp_ns, settings)
+        mass_kg, source = None, None
+        if odometry.mass is not None:
+            mass_kg, source = self._mass_at(kinematics.stamp_ns, settings)
+        state = state_from_kinematics(kinematics, mass_kg, self._layout, limits=settings.limits)
         self._last_state_ns = kinematics.stamp_ns
-        return AcceptedState(state_from_kinematics(kinematics, mass_kg, self._layout), source)
+        return AcceptedState(state, source)
 
     def accept_joint_state(
         self, message: JointState, now_ns: int, settings: InputSettings

@@ -30,14 +30,14 @@ from dscp_ros.planner.attempts import AttemptRunner, PlanJob, Surroundings
 from dscp_ros.planner.events import ThrottledLog, event_report, refusal_report
 from dscp_ros.planner.health import HealthMonitor
 from dscp_ros.planner.input_checks import FROM_PARAMETER, AcceptedState, InputGate, InputSettings
-from dscp_ros.planner.interfaces import interface_of
 from dscp_ros.planner.outputs import PlanOutputs
 from dscp_ros.planner.parameter_files import ParameterArguments
 from dscp_ros.planner.parameter_server import FileChange, ParameterServer
-from dscp_ros.planner.parameters import RELIABLE, NodeSettings, problem_layout
+from dscp_ros.planner.parameters import RELIABLE, NodeSettings
 from dscp_ros.planner.session import PlannerSetup, PlanningSession
 from dscp_ros.planner.worker import MailboxWorker
 from msg_adapters.errors import InputCode, RejectedInputError
+from msg_adapters.layout import StateLayout, problem_layout
 from msg_adapters.report import NodeCode, PlanReport
 from msg_adapters.stamps import nanoseconds_from_stamp
 
@@ -64,14 +64,18 @@ class PlannerNode:
         self._node = node
         self._parameters = ParameterServer(node, arguments)
         settings = self._parameters.settings
-        layout = problem_layout(self._parameters.problem)
+        problem = self._parameters.problem
+        layout = problem_layout(problem)
+        frame = settings.inputs.frame or layout.frame
         self._problem = layout.problem
         self._session = PlanningSession(self._parameters.setup)
         self._requested: PlannerSetup | None = self._parameters.setup
         self._gate = InputGate(layout)
         self._health = HealthMonitor()
         self._warnings = ThrottledLog(node.get_logger().warning)
-        self._outputs = PlanOutputs(node, layout, frame=settings.inputs.frame)
+        self._outputs = PlanOutputs(
+            node, layout, frame=frame, draws=problem.extras.scene is not None
+        )
         self._last: AcceptedState | None = None
         surroundings = Surroundings(
             now_ns=self._now_ns,
@@ -82,14 +86,19 @@ class PlannerNode:
             log_warning=self._warn,
         )
         self._runner = AttemptRunner(
-            self._session, self._outputs, self._health, layout, surroundings
+            self._session,
+            self._outputs,
+            self._health,
+            layout,
+            surroundings,
+            [miss.name for miss in problem.misses],
         )
         self._worker: MailboxWorker[PlanJob] = MailboxWorker(self._runner.run, name="planner")
         self._parameters.on_change(self._on_settings)
-        self._open(settings)
+        self._open(settings, layout)
         node.get_logger().info(
             f"planning {self._problem} with {settings.planner.options.solver}, "
-            f"{settings.planner.intervals} intervals, from states in {settings.inputs.frame}, "
+            f"{settings.planner.intervals} intervals, from states in {frame}, "
             f"{settings.planner.terminal_time.value} terminal time, "
             f"parameter set {self._parameters.setup.parameter_set}"
         )
@@ -111,7 +120,7 @@ class PlannerNode:
         self._warn(NodeCode.INTERNAL_ERROR, f"a callback failed, the node lives on: {trace}")
         self._outputs.publish_report(self._event(NodeCode.INTERNAL_ERROR, message, "callback"))
 
-    def _open(self, settings: NodeSettings) -> None:
+    def _open(self, settings: NodeSettings, layout: StateLayout) -> None:
         """Create subscriptions, services and the health timer."""
         node = self._node
         reliability = (
@@ -121,9 +130,10 @@ class PlannerNode:
         )
         newest = QoSProfile(depth=1, reliability=reliability)
         few = QoSProfile(depth=_MASS_DEPTH, reliability=reliability)
-        if interface_of(self._problem).odometry:
+        if layout.odometry is not None:
             node.create_subscription(Odometry, "~/state", self._on_state, newest)
-            node.create_subscription(InertiaStamped, "~/mass", self._on_mass, few)
+            if layout.odometry.mass is not None:
+                node.create_subscription(InertiaStamped, "~/mass", self._on_mass, few)
         node.create_subscription(JointState, "~/vehicle_state", self._on_vehicle_state, newest)
         # Services wait for the worker; in a group of their own they hold up nothing else.
         group = ReentrantCallbackGroup()
@@ -286,7 +296,7 @@ class PlannerNode:
     def _change(self, setup: PlannerSetup) -> bool:
         rebuilt = self._session.change(setup)
         if rebuilt:
-            # A plan with fewer intervals would leave thrust arrows of the old one standing.
+            # A plan with fewer intervals would leave arrows of the old one standing.
             self._outputs.clear_drawing(self._now_ns())
         return rebuilt
 

@@ -12,7 +12,7 @@ from visualization_msgs.msg import MarkerArray
 from dscp_core.planning.plan import Plan
 from msg_adapters.diagnostics import Health, message_from_health
 from msg_adapters.drawing import Drawing, no_markers
-from msg_adapters.frames import StateLayout
+from msg_adapters.layout import StateLayout
 from msg_adapters.report import PlanReport
 from msg_adapters.report_message import message_from_report
 from msg_adapters.trajectory import TrajectoryEncoder
@@ -33,21 +33,24 @@ def latched(depth: int) -> QoSProfile:
 class PlanOutputs:
     """Publishers of plans, reports and health."""
 
-    def __init__(self, node: Node, layout: StateLayout, *, frame: str) -> None:
+    def __init__(self, node: Node, layout: StateLayout, *, frame: str, draws: bool) -> None:
         """Create the publishers.
 
         Args:
             node: Node to publish from.
             layout: Names and order of the problem's state.
-            frame: Landing frame.
+            frame: Frame of states and plans.
+            draws: Whether there are drawings; without, nobody is offered any.
         """
         self._name = node.get_fully_qualified_name().lstrip("/")
         self._layout = layout
         self._frame = frame
         self._encoder: TrajectoryEncoder | None = None
         self._trajectory = node.create_publisher(JointTrajectory, "~/trajectory", latched(1))
-        self._path = node.create_publisher(Path, "~/path", latched(1))
-        self._markers = node.create_publisher(MarkerArray, "~/markers", latched(1))
+        self._path = node.create_publisher(Path, "~/path", latched(1)) if draws else None
+        self._markers = (
+            node.create_publisher(MarkerArray, "~/markers", latched(1)) if draws else None
+        )
         self._report = node.create_publisher(DiagnosticArray, "~/report", latched(_REPORT_DEPTH))
         self._health = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
 
@@ -62,20 +65,22 @@ class PlanOutputs:
             self._encoder = TrajectoryEncoder(self._layout, nodes, frame=self._frame)
         self._trajectory.publish(self._encoder.encode(plan, stamp_ns))
 
-    def publish_drawing(self, plan: Plan, stamp_ns: int, drawing: Drawing) -> None:
-        """Publish what people look at.
+    def publish_drawing(self, plan: Plan, stamp_ns: int, drawing: Drawing | None) -> None:
+        """Publish what people look at, if there is anything.
 
         Raises:
-            RejectedInputError: The plan holds NaN; nothing is published.
+            InvalidInputError: The problem's scene is none; nothing is published.
         """
-        path = drawing.path(plan, stamp_ns, frame=self._frame)
-        markers = drawing.markers(plan, stamp_ns, frame=self._frame)
+        if drawing is None or self._path is None or self._markers is None:
+            return
+        path, markers = drawing.draw(plan, stamp_ns, frame=self._frame)
         self._path.publish(path)
         self._markers.publish(markers)
 
     def clear_drawing(self, stamp_ns: int) -> None:
         """Remove every marker: there is no plan."""
-        self._markers.publish(no_markers(stamp_ns, frame=self._frame))
+        if self._markers is not None:
+            self._markers.publish(no_markers(stamp_ns, frame=self._frame))
 
     def publish_report(self, report: PlanReport) -> None:
         """Publish what became of an input or attempt."""

@@ -15,21 +15,21 @@ from rclpy.exceptions import (
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from dscp_core import problems
 from dscp_core.errors import DscpError, InvalidInputError
 from dscp_core.planning.planner import TerminalTime
+from dscp_ros.planner.choice import ProblemChoice, is_file
 from dscp_ros.planner.declaration import NodeParameter
 from dscp_ros.planner.parameter_files import (
     ParameterArguments,
     check_node_names,
     check_parameter_names,
 )
-from dscp_ros.planner.parameter_sources import ParameterSources, read_sources
+from dscp_ros.planner.parameter_sources import ParameterSources, named_problem, read_sources
 from dscp_ros.planner.parameters import (
     NETWORK,
     PROBLEM,
     NodeSettings,
-    formulation_parameter,
+    formulation_parameters,
     node_settings,
     parameter_table,
 )
@@ -85,9 +85,9 @@ class ParameterServer:
         self._arguments = arguments
         check_node_names(arguments, node.get_fully_qualified_name())
         self._table: dict[str, NodeParameter] = {}
-        problem_name = self._declare(PROBLEM)
-        self._formulation = self._declare(formulation_parameter(problem_name))
-        self.problem = problems.get(problem_name, self._formulation)
+        self._choice = self._read_choice()
+        forms = formulation_parameters(self._choice.family.formulations)
+        self.problem = self._choice.make("".join(self._declare(form) for form in forms))
         for parameter in parameter_table(self.problem):
             self._declare(parameter)
         # rclpy offers no public way to what the command line and files gave; it ignores names
@@ -96,7 +96,7 @@ class ParameterServer:
         check_parameter_names(list(given), list(node.get_parameters_by_prefix("")))
         self._origin = self._read()
         self._take_over(self._values())
-        self._origin.sources.check_vehicle(self._vehicle(self.settings))
+        self._check_sets(self._origin, self.settings)
         self._on_change: Callable[[], None] | None = None
         node.add_on_set_parameters_callback(self._validate)
         node.add_post_set_parameters_callback(self._apply)
@@ -126,7 +126,7 @@ class ParameterServer:
         read |= self._dropped(given, current)
         values = self._merged(read)
         settings = self._settings_of(values)
-        origin.sources.check_vehicle(self._vehicle(settings))
+        self._check_sets(origin, settings)
         return FileChange(
             setup=self._setup_of(settings, values, origin),
             values={n: v for n, v in read.items() if not self._table[n].read_only},
@@ -160,8 +160,27 @@ class ParameterServer:
             and current[name] == _plain(before[name])
         }
 
+    def _read_choice(self) -> ProblemChoice:
+        """The problem. Its file is run, so that a parameter set must not have named one.
+
+        Raises:
+            InvalidInputError: Nothing is known by its name, or what was found is no problem.
+            ParameterSetError: A parameter set names a Python file.
+        """
+        text = self._declare(PROBLEM)
+        named = named_problem(self._arguments, self._node.get_fully_qualified_name())
+        by_file = self._arguments.files and PROBLEM.name not in self._arguments.names
+        if by_file and is_file(text) and named != text:  # rcl has read another file than this
+            raise InvalidInputError(PROBLEM.name, text, f"{named!r}, as in the files by now")
+        return ProblemChoice.read(text)
+
+    def _check_sets(self, origin: _Origin, settings: NodeSettings) -> None:
+        origin.sources.check_vehicle(self.problem.name, self._vehicle(settings))
+
     def _read(self) -> _Origin:
-        sources = read_sources(self._arguments, self._node.get_fully_qualified_name())
+        """Read the files; that of the problem is not run again."""
+        node_name = self._node.get_fully_qualified_name()
+        sources = read_sources(self._arguments, node_name, self._choice)
         return _Origin(sources, Predictors(self.problem.extras.network, sources.network))
 
     def _declare(self, parameter: NodeParameter) -> Any:
@@ -170,17 +189,22 @@ class ParameterServer:
             self._node.declare_parameter(parameter.name, parameter.default, parameter.descriptor())
             value = _plain(self._node.get_parameter(parameter.name).value)
         except InvalidParameterTypeException as error:
-            given = self._node._parameter_overrides[parameter.name].value
-            raise InvalidInputError(parameter.name, given, parameter.type_text) from error
+            raise InvalidInputError(
+                parameter.name, self._first_value(parameter), parameter.type_text
+            ) from error
         except InvalidParameterValueException as error:
-            given = self._node._parameter_overrides[parameter.name].value
             bound = f"[{parameter.lower:g}, {parameter.upper:g}] {parameter.unit}".rstrip()
-            raise InvalidInputError(parameter.name, given, bound) from error
+            raise InvalidInputError(parameter.name, self._first_value(parameter), bound) from error
         except ParameterUninitializedException:
             value = None
         parameter.check(value)
         self._table[parameter.name] = parameter
         return value
+
+    def _first_value(self, parameter: NodeParameter) -> Any:
+        """Value that was refused: the command line's or a file's, else the default."""
+        given = self._node._parameter_overrides.get(parameter.name)
+        return parameter.default if given is None else given.value
 
     def _values(self) -> dict[str, Any]:
         return {name: _plain(self._node.get_parameter(name).value) for name in self._table}

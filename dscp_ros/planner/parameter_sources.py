@@ -7,10 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from dscp_ros.parameter_set import ParameterSet, directory_of, load
-from dscp_ros.planner.interfaces import VEHICLE_PREFIX
+from dscp_core.errors import InvalidInputError
+from dscp_ros.parameter_set import ParameterSet, ParameterSetError, directory_of, load
+from dscp_ros.parameter_set.values import refuse_file
+from dscp_ros.planner.choice import ProblemChoice
+from dscp_ros.planner.declaration import VEHICLE_PREFIX
 from dscp_ros.planner.parameter_files import ParameterArguments, read_file
-from dscp_ros.planner.parameters import NETWORK
+from dscp_ros.planner.parameters import NETWORK, PROBLEM
 from dscp_ros.planner.predictors import NamedNetwork
 
 NO_SET = "none"
@@ -31,16 +34,22 @@ class ParameterSources:
     sets: tuple[ParameterSet, ...]
     network: NamedNetwork | None
 
-    def check_vehicle(self, vehicle: Mapping[str, Any]) -> None:
-        """Refuse a vehicle that a set was not made for.
+    def check_vehicle(self, problem: str, vehicle: Mapping[str, Any]) -> None:
+        """Refuse a problem or vehicle that a set was not made for.
 
         Args:
+            problem: Name of the problem.
             vehicle: What `OptimalControlProblem.vehicle_of` gives.
 
         Raises:
-            ParameterSetError: A set is of another vehicle.
+            ParameterSetError: A set is of another problem or vehicle.
         """
         for parameter_set in self.sets:
+            if parameter_set.problem != problem:
+                raise ParameterSetError(
+                    f"{parameter_set.directory}: of the problem {parameter_set.problem}, not of "
+                    f"{problem}"
+                )
             parameter_set.check_vehicle(vehicle)
 
     def label(self, values: Mapping[str, Any], vehicle: Mapping[str, Any]) -> str:
@@ -59,12 +68,39 @@ class ParameterSources:
         return " + ".join(labels) or NO_SET
 
 
-def read_sources(arguments: ParameterArguments, node_name: str) -> ParameterSources:
+def named_problem(arguments: ParameterArguments, node_name: str) -> str | None:
+    """The problem that the parameter files name, later ones winning; nothing is run.
+
+    Args:
+        arguments: Parameter sources of the command line.
+        node_name: Fully qualified name of the node.
+
+    Raises:
+        InvalidInputError: A file is missing, no YAML, or no parameter file.
+        ParameterSetError: A parameter set names a Python file.
+    """
+    named = None
+    for path in arguments.files:
+        found = read_file(path, node_name).get(PROBLEM.name)
+        folder = directory_of(path)
+        if folder is not None and found is not None:
+            try:
+                refuse_file(found)
+            except InvalidInputError as error:
+                raise ParameterSetError(f"{folder}: {error}") from None
+        named = named if found is None else str(found)
+    return named
+
+
+def read_sources(
+    arguments: ParameterArguments, node_name: str, choice: ProblemChoice | None = None
+) -> ParameterSources:
     """Read the parameter files, later ones winning.
 
     Args:
         arguments: Parameter sources of the command line.
         node_name: Fully qualified name of the node.
+        choice: The problem, for sets that do not name a known one.
 
     Raises:
         InvalidInputError: A file is missing, no YAML, or no parameter file.
@@ -79,7 +115,7 @@ def read_sources(arguments: ParameterArguments, node_name: str) -> ParameterSour
             found: Mapping[str, Any] = read_file(path, node_name)
             own = None
         else:
-            sets.append(load(folder))
+            sets.append(load(folder, choice))
             found, own = sets[-1].values, sets[-1].terminal_time_network
         values.update(found)
         if NETWORK in found:

@@ -6,7 +6,7 @@ code here, and another vehicle is a YAML file.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -17,17 +17,23 @@ from dscp_core.planning.certificate import ControlHold
 from dscp_core.planning.planner import PlannerSettings, TerminalTime
 from dscp_core.problem.declaration import OptimalControlProblem
 from dscp_core.scp.scp import ScpOptions
-from dscp_ros.planner.declaration import NodeParameter, Value
+from dscp_ros.planner.declaration import VEHICLE_PREFIX, NodeParameter, Value
 from dscp_ros.planner.input_checks import InputSettings
-from dscp_ros.planner.interfaces import VEHICLE_PREFIX, interface_of
+from dscp_ros.planner.interface import (
+    drawing,
+    input_settings,
+    interface_parameters,
+    node_parameter,
+)
 from msg_adapters.drawing import Drawing
-from msg_adapters.frames import StateLayout, state_layout
+from msg_adapters.layout import problem_layout
 from msg_adapters.parameters import (
     follows_message_axes,
     parameter_to_core_axes,
     parameter_to_message_axes,
 )
 
+FORMULATION = "formulation"
 NETWORK = "terminal_time_network"
 RELIABLE = "reliable"
 BEST_EFFORT = "best_effort"
@@ -47,7 +53,7 @@ class NodeSettings:
         inputs: What inputs have to satisfy.
         deadline_s: Wall time of one plan.
         state_reliability: Reliability that the state subscriptions ask for.
-        markers: How plans are drawn.
+        drawing: How plans are drawn; None if not at all.
         log_period_s: Least time between two log lines of the same cause.
     """
 
@@ -55,44 +61,54 @@ class NodeSettings:
     inputs: InputSettings
     deadline_s: float
     state_reliability: str
-    markers: Drawing
+    drawing: Drawing | None
     log_period_s: float
 
 
 PROBLEM = NodeParameter(
     "problem",
     problems.DEFAULT,
-    "Problem that is planned for.",
-    choices=problems.names(),
+    "Problem that is planned for: a known name, or FILE.py:NAME.",
     read_only=True,
 )
 
 
-def formulation_parameter(problem: str) -> NodeParameter:
-    """Parameter that chooses among a problem's formulations."""
-    names = problems.formulations(problem)
-    return NodeParameter(
-        "formulation", names[0], "Form of the subproblem.", choices=names, read_only=True
+def formulation_parameters(formulations: Sequence[str]) -> tuple[NodeParameter, ...]:
+    """Parameter that chooses among formulations, the default first; none where there are none."""
+    names = tuple(formulations)
+    if not names:
+        return ()
+    return (
+        NodeParameter(
+            FORMULATION, names[0], "Form of the subproblem.", choices=names, read_only=True
+        ),
     )
 
 
-def problem_layout(problem: OptimalControlProblem) -> StateLayout:
-    """Order of the problem's state in messages."""
-    return state_layout(problem.name, [state.name for state in problem.states])
-
-
 def parameter_table(problem: OptimalControlProblem) -> tuple[NodeParameter, ...]:
-    """Every parameter but the problem and its formulation."""
-    interface = interface_of(problem.name)
+    """Every parameter but the problem and its formulation.
+
+    Raises:
+        InvalidInputError: A setting that the problem brings has a name that is taken, or a default
+            is for a name that does not exist.
+    """
     general = (*_NODE, *_PLANNING, *_terminal_time_parameters(problem))
+    table = (*interface_parameters(problem), *general, *_vehicle_parameters(problem))
+    own = problem.extras.messages.defaults
+    names = [PROBLEM.name, FORMULATION, *(parameter.name for parameter in table)]
+    if twice := sorted({name for name in names if names.count(name) > 1}):
+        raise InvalidInputError(f"settings of {problem.name}", twice, "names that are not taken")
+    if unknown := sorted(set(own) - set(names)):
+        raise InvalidInputError(f"defaults of {problem.name}", unknown, "names of settings")
     defaults: dict[str, Value] = {
+        "intervals": problem.default_intervals,
         "cost_tolerance": max(_COST_TOLERANCE, problem.cost_tolerance),
         "defect_tolerance": problem.defect_tolerance,
-        **interface.defaults,
+        **own,
     }
     return tuple(
         replace(parameter, default=defaults.get(parameter.name, parameter.default))
-        for parameter in (*interface.parameters, *general, *_vehicle_parameters(problem))
+        for parameter in table
     )
 
 
@@ -103,9 +119,8 @@ def node_settings(problem: OptimalControlProblem, values: Mapping[str, Any]) -> 
         InvalidInputError: A solver is unknown, or a vehicle number is refused by the problem.
     """
     _check_solver(values["solver"])
-    interface = interface_of(problem.name)
     vehicle = _vehicle_values(problem, values)
-    problem.pack(vehicle)
+    parameters = problem.table.unpack(problem.pack(vehicle))
     return NodeSettings(
         planner=PlannerSettings(
             parameters=vehicle,
@@ -120,10 +135,10 @@ def node_settings(problem: OptimalControlProblem, values: Mapping[str, Any]) -> 
                 solver=values["solver"],
             ),
         ),
-        inputs=interface.inputs(values),
+        inputs=input_settings(problem, values, parameters),
         deadline_s=values["deadline_s"],
         state_reliability=values["state_reliability"],
-        markers=interface.drawing(values),
+        drawing=drawing(problem, values, parameters),
         log_period_s=values["log_period_s"],
     )
 
@@ -206,9 +221,10 @@ _PLANNING = (
 def _terminal_time_parameters(problem: OptimalControlProblem) -> list[NodeParameter]:
     """Where the terminal time comes from; networks exist for some problems only."""
     free_or_fixed = (TerminalTime.FREE.value, TerminalTime.FIXED.value)
+    suited = TerminalTime.FREE if problem.free_terminal_time else TerminalTime.FIXED
     source = NodeParameter(
         "terminal_time_source",
-        TerminalTime.FREE.value,
+        suited.value,
         "free: optimised with every plan. fixed: parameters.terminal_time after the first state, "
         "then what is left of it.",
         choices=free_or_fixed,
@@ -240,24 +256,16 @@ def _vehicle_parameters(problem: OptimalControlProblem) -> list[NodeParameter]:
     for declared in problem.table.parameters:
         if declared.name in problem.initial_state_parameters:
             continue
-        default: Value
+        parameter = node_parameter(declared)
         if isinstance(declared.default, tuple):
             default = parameter_to_message_axes(layout, declared.default)
-            description = declared.description.replace(", x up", "")
+            parameter = replace(parameter, default=default)
             if follows_message_axes(layout, declared.default):
-                description += " Axes and order as in messages."
-        else:
-            default, description = float(declared.default), declared.description
-        table.append(
-            NodeParameter(
-                VEHICLE_PREFIX + declared.name,
-                default,
-                description,
-                declared.unit,
-                declared.lower,
-                declared.upper,
-            )
-        )
+                description = declared.description.replace(", x up", "")
+                parameter = replace(
+                    parameter, description=f"{description} Axes and order as in messages."
+                )
+        table.append(replace(parameter, name=VEHICLE_PREFIX + declared.name))
     return table
 
 

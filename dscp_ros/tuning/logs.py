@@ -18,7 +18,7 @@ from dscp_ros.bag import BagReader, MessageDecodeError
 from dscp_ros.planner.input_checks import AcceptedState, InputGate, InputSettings
 from dscp_ros.tuning.reports import ReportSummary
 from msg_adapters.errors import InputCode, RejectedInputError
-from msg_adapters.frames import StateLayout
+from msg_adapters.layout import StateLayout
 from msg_adapters.report import NodeCode, PlanReport
 from msg_adapters.report_message import report_from_message
 from msg_adapters.stamps import nanoseconds_from_stamp
@@ -95,17 +95,20 @@ class LogContent:
         )
 
 
-def topics_of_node(node: str, renamed: Mapping[str, str]) -> dict[str, str]:
+def topics_of_node(node: str, renamed: Mapping[str, str], layout: StateLayout) -> dict[str, str]:
     """Topics to read, by what they hold.
 
     Args:
         node: Name of the planner node.
         renamed: Topics that stand in the log under other names, by what they hold.
+        layout: Names and order of the problem's state.
 
     Raises:
         InvalidInputError: Something that the node does not listen to or publish.
     """
-    known = (STATE, VEHICLE_STATE, MASS, REPORT)
+    odometry = layout.odometry
+    heard = {STATE: odometry is not None, MASS: odometry is not None and odometry.mass is not None}
+    known = [name for name in (STATE, VEHICLE_STATE, MASS, REPORT) if heard.get(name, True)]
     for name in renamed:
         if name not in known:
             raise InvalidInputError("--topic", name, f"one of {', '.join(known)}")
@@ -151,7 +154,8 @@ def _found_topics(reader: BagReader, path: Path, topics: Mapping[str, str]) -> d
     """What the log's topics hold, by topic name."""
     found = {topic: kind for kind, topic in topics.items() if topic in reader.topics}
     if not any(kind in (STATE, VEHICLE_STATE, REPORT) for kind in found.values()):
-        wanted = ", ".join(topics[kind] for kind in (STATE, VEHICLE_STATE, REPORT))
+        kinds = (STATE, VEHICLE_STATE, REPORT)
+        wanted = ", ".join(topics[kind] for kind in kinds if kind in topics)
         has = ", ".join(reader.topics) or "no topics"
         raise InvalidInputError("log", str(path), f"a log with one of {wanted}; it has: {has}")
     if _CLOCK in reader.topics:

@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 
 from dscp_core.problem.parameters import Value
-from dscp_ros.parameter_set.values import CheckedValues
-from dscp_ros.planner.interfaces import VEHICLE_PREFIX
-from dscp_ros.planner.parameters import NETWORK, problem_layout
+from dscp_ros.parameter_set.values import CheckedValues, chosen_names
+from dscp_ros.planner.declaration import VEHICLE_PREFIX
+from dscp_ros.planner.parameters import NETWORK, PROBLEM
+from msg_adapters.layout import problem_layout
 from msg_adapters.parameters import parameter_to_message_axes
 
 _PLANNING = (
@@ -50,11 +51,10 @@ def set_values(start: CheckedValues, tuned: Mapping[str, Value]) -> dict[str, An
             if isinstance(value, np.ndarray)
             else float(value)
         )
-    given = {k: v for k, v in start.given.items() if k != NETWORK}
+    given = {k: v for k, v in start.given.items() if k not in (NETWORK, PROBLEM.name)}
     planning = {name: start.values[name] for name in _PLANNING}
     return {
-        "problem": problem.name,
-        "formulation": start.formulation,
+        **chosen_names(start.choice, start.formulation),
         **given,
         **planning,
         **vehicle,

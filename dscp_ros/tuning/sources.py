@@ -11,6 +11,7 @@ from typing import Any
 
 import dscp_ros
 from dscp_core.errors import InvalidInputError
+from dscp_ros.planner.choice import ProblemChoice
 
 _GIT_S = 10.0
 
@@ -69,6 +70,18 @@ def code_version() -> dict[str, Any]:
         "git_revision": revision,
         "git_changed_files": None if changes is None else len(changes.splitlines()),
     }
+
+
+def problem_source(choice: ProblemChoice) -> dict[str, Any]:
+    """What a problem was named by, and the SHA-256 of its file if it is one of a Python file.
+
+    Raises:
+        OSError: The file has gone.
+    """
+    if not choice.is_file:
+        return {"name": choice.text}
+    path = Path(choice.text.rpartition(":")[0])
+    return {"name": choice.text, "sha256": hashlib.sha256(path.read_bytes()).hexdigest()}
 
 
 def _git(folder: Path, *arguments: str) -> str | None:

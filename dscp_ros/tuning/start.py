@@ -12,10 +12,11 @@ from dscp_core.planning.planner import TerminalTime
 from dscp_core.planning.terminal_time_network import TerminalTimeNetwork
 from dscp_core.tuning.quantities import TunedParameter
 from dscp_ros.parameter_set.values import CheckedValues, check_values
+from dscp_ros.planner.choice import ProblemChoice
 from dscp_ros.planner.parameter_files import ParameterArguments, check_node_names
-from dscp_ros.planner.parameter_sources import ParameterSources, read_sources
-from dscp_ros.planner.parameters import NETWORK, PROBLEM, problem_layout
-from msg_adapters.frames import StateLayout
+from dscp_ros.planner.parameter_sources import ParameterSources, named_problem, read_sources
+from dscp_ros.planner.parameters import NETWORK, PROBLEM
+from msg_adapters.layout import StateLayout, problem_layout
 
 _SOURCE = "terminal_time_source"
 _SHIPPED = "shipped"
@@ -72,7 +73,7 @@ def read_start(
         files: Parameter files of the node; later ones win. One of a parameter set is checked as a
             whole.
         node: Name of the node that they are for.
-        problem: Problem, where the files do not name it.
+        problem: Problem, where the files do not name it: a known name, or ``FILE.py:NAME``.
         network: File of the terminal-time network; it makes the terminal time predicted.
         tunes_network: Whether a network is tuned, which makes the terminal time predicted too.
 
@@ -85,18 +86,20 @@ def read_start(
     """
     arguments = ParameterArguments(tuple(map(str, files)), frozenset(), ())
     check_node_names(arguments, node)
-    sources = read_sources(arguments, node)
+    named = named_problem(arguments, node)
+    if problem is not None and named not in (None, problem):
+        raise InvalidInputError("--problem", problem, f"{named}, as in the files")
+    choice = ProblemChoice.read(problem or named or str(PROBLEM.default))
+    sources = read_sources(arguments, node, choice)
     given = dict(sources.values)
-    if problem is not None and given.setdefault(PROBLEM.name, problem) != problem:
-        raise InvalidInputError("--problem", problem, f"{given[PROBLEM.name]}, as in the files")
-    values = check_values(given)
-    sources.check_vehicle(values.vehicle)
+    values = check_values(given, choice)
+    sources.check_vehicle(values.problem.name, values.vehicle)
     notes: tuple[str, ...] = ()
     source = values.planner.terminal_time
     if (network or tunes_network) and source is not TerminalTime.PREDICTED:
         if values.problem.extras.network is None:
             raise InvalidInputError("network", values.problem.name, "a problem that has networks")
-        values = check_values({**given, _SOURCE: TerminalTime.PREDICTED.value})
+        values = check_values({**given, _SOURCE: TerminalTime.PREDICTED.value}, choice)
         notes = (f"{_SOURCE} is predicted, for the network; it was {source.value}",)
     origin: dict[str, Any] = {
         "parameter_files": [str(file) for file in files],
@@ -112,7 +115,7 @@ def read_start(
         if tunes_network:
             notes = (*notes, f"the network starts from one of another vehicle: {error}")
         elif origin["network"] == _SHIPPED:
-            free = check_values({**given, _SOURCE: TerminalTime.FREE.value})
+            free = check_values({**given, _SOURCE: TerminalTime.FREE.value}, choice)
             note = (
                 f"{_SOURCE} is free, as the node has it without a network of the vehicle: {error}"
             )

@@ -24,9 +24,9 @@ from dscp_ros.bag import BagWriter, Qos
 from dscp_ros.cli import ExitCode
 from dscp_ros.cli import main as frame
 from dscp_ros.parameter_set import PARAMETERS_FILE, load, save
-from dscp_ros.planner.parameters import problem_layout
 from dscp_ros.tuning.sources import file_digests
 from msg_adapters.joint_state import joint_state_from_state
+from msg_adapters.layout import problem_layout
 from msg_adapters.state import StampedState
 
 ROOT = Path(__file__).resolve().parents[2]

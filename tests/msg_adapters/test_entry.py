@@ -16,15 +16,17 @@ from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory
 from visualization_msgs.msg import Marker, MarkerArray
 
+from dscp_core import problems
 from dscp_core.errors import InvalidInputError
 from dscp_core.planning.plan import Plan
-from msg_adapters.entry_state import EntryLimits, turned
-from msg_adapters.entry_visualisation import EntryMarkerStyle
+from dscp_core.problems.entry.messages import PLANET_FRAME, EntryLimits, turned
+from dscp_core.problems.entry.planet import planet_fixed
+from dscp_core.problems.entry.scene import EntryStyle, entry_scene
+from msg_adapters.drawing import Drawing
 from msg_adapters.errors import InputCode, RejectedInputError
-from msg_adapters.frames import PLANET_FRAME, ControlField, state_layout
 from msg_adapters.joint_state import joint_state_from_state, state_from_joint_state
+from msg_adapters.layout import ControlForm, problem_layout
 from msg_adapters.path import poses_from_path
-from msg_adapters.planet import planet_fixed
 from msg_adapters.state import StampedState
 from msg_adapters.trajectory import plan_from_trajectory, trajectory_from_plan
 
@@ -41,10 +43,11 @@ STATE_NAMES = (
 MESSAGE_NAMES = ("r", *STATE_NAMES[1:])
 CONTROL_NAMES = ("angle_of_attack_rate", "bank_rate")
 CONTROL_STATES = (6, 7)
-LAYOUT = state_layout("entry", STATE_NAMES)
+LAYOUT = problem_layout(problems.get("entry"))
 STAMP_NS = 12_000_000_345
 RADIUS_M = 6371.1e3
 LIMITS = EntryLimits()
+STYLE = EntryStyle()
 # All angles differ, so that a swapped name shows.
 STATE = np.array([RADIUS_M + 60e3, 0.7, 0.1, 6000.0, -0.02, 1.4, 0.35, -0.6])
 
@@ -65,7 +68,8 @@ def joint_state(values: np.ndarray = STATE) -> JointState:
 
 
 def decode(message: JointState, limits: EntryLimits | None = None) -> np.ndarray:
-    return state_from_joint_state(message, LAYOUT, frame=PLANET_FRAME, limits=limits).values
+    admit = (limits or LIMITS).admit
+    return state_from_joint_state(message, LAYOUT, frame=PLANET_FRAME, limits=admit).values
 
 
 def refusal(message: JointState) -> RejectedInputError:
@@ -283,14 +287,15 @@ def example_plan(nodes: int = 7) -> Plan:
     )
 
 
+def draw(
+    plan: Plan, style: EntryStyle = STYLE, stamp_ns: int = STAMP_NS
+) -> tuple[Path, MarkerArray]:
+    drawing = Drawing(lambda plan, *_: entry_scene(plan, style), {}, {})
+    return drawing.draw(plan, stamp_ns, frame=PLANET_FRAME)
+
+
 def decode_trajectory(message: JointTrajectory) -> tuple[Plan, int]:
-    return plan_from_trajectory(
-        message,
-        LAYOUT,
-        control_names=CONTROL_NAMES,
-        control_states=CONTROL_STATES,
-        frame=PLANET_FRAME,
-    )
+    return plan_from_trajectory(message, LAYOUT, frame=PLANET_FRAME)
 
 
 def trajectory() -> JointTrajectory:
@@ -310,7 +315,7 @@ def test_a_trajectory_comes_back_through_the_wire():
 
 
 def test_the_rates_of_the_angles_are_the_controls():
-    assert LAYOUT.control_field is ControlField.VELOCITIES
+    assert LAYOUT.control_form is ControlForm.VELOCITIES
     plan = example_plan()
     # The rates that are computed may differ from the controls by a rounding: the controls count.
     message = trajectory_from_plan(
@@ -335,7 +340,7 @@ def test_a_trajectory_with_efforts_is_refused():
 
 def test_the_path_holds_positions_and_attitudes():
     plan = example_plan()
-    path = through_the_wire(EntryMarkerStyle().path(plan, STAMP_NS, frame=PLANET_FRAME))
+    path = through_the_wire(draw(plan)[0])
     assert isinstance(path, Path)
     assert path.header.frame_id == path.poses[-1].header.frame_id == "earth"
     last = path.poses[-1].header.stamp
@@ -348,8 +353,8 @@ def test_the_path_holds_positions_and_attitudes():
 
 def test_markers_show_the_path_the_ground_track_the_lift_and_the_planet():
     plan = example_plan()
-    style = EntryMarkerStyle(lift_arrow_m=1e5)
-    first, second = (style.markers(plan, STAMP_NS + k, frame=PLANET_FRAME) for k in range(2))
+    style = EntryStyle(lift_arrow_m=1e5)
+    first, second = (draw(plan, style, STAMP_NS + k)[1] for k in range(2))
     keys = [(marker.ns, marker.id) for marker in first.markers]
     assert len(set(keys)) == len(keys) == len(plan.times_s) + 3
     assert keys == [(marker.ns, marker.id) for marker in second.markers]
@@ -372,8 +377,6 @@ def test_nan_is_never_drawn():
     states = plan.states.copy()
     states[2, 0] = math.nan
     broken = replace(plan, states=states)
-    style = EntryMarkerStyle()
-    for build in (style.path, style.markers):
-        with pytest.raises(RejectedInputError) as caught:
-            build(broken, STAMP_NS, frame=PLANET_FRAME)
-        assert caught.value.code is InputCode.NOT_FINITE
+    with pytest.raises(RejectedInputError) as caught:
+        draw(broken)
+    assert caught.value.code is InputCode.NOT_FINITE

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,16 +9,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from dscp_core import problems
 from dscp_core.errors import InvalidInputError
+from dscp_core.problem.messages import Odometry
+from dscp_core.problems.powered_descent.messages import message_from_core
+from dscp_core.problems.powered_descent.scene import quaternion_from_z_axis
 from msg_adapters.errors import InputCode, RejectedInputError
-from msg_adapters.frames import (
-    core_from_ros,
-    quaternion_from_z_axis,
-    ros_from_core,
-    rotate,
-    state_layout,
-    unit_quaternion,
-)
+from msg_adapters.frames import rotate, unit_quaternion
+from msg_adapters.layout import StateLayout, problem_layout
+
+DESCENT = problems.get("powered_descent")
+LAYOUT = problem_layout(DESCENT)
 
 # Two ulps of numbers of order one, a few operations deep.
 ROUNDING = 1e-14
@@ -26,19 +28,24 @@ components = st.floats(-1e3, 1e3, allow_subnormal=False)
 vectors = st.tuples(components, components, components).map(np.array)
 
 
+def orbit(*names: str, **changes: object) -> StateLayout:
+    return StateLayout("orbit", names, names, names, ("thrust",), **changes)
+
+
 def test_core_up_is_ros_z():
-    assert ros_from_core(np.array([1.0, 2.0, 3.0])).tolist() == [2.0, 3.0, 1.0]
-    assert core_from_ros(np.array([1.0, 2.0, 3.0])).tolist() == [3.0, 1.0, 2.0]
+    for to_messages in (LAYOUT.to_message_axes, message_from_core):
+        assert to_messages(np.array([1.0, 2.0, 3.0])).tolist() == [2.0, 3.0, 1.0]
+    assert LAYOUT.to_core_axes(np.array([1.0, 2.0, 3.0])).tolist() == [3.0, 1.0, 2.0]
 
 
 def test_axes_mapping_is_a_rotation():
-    matrix = ros_from_core(np.eye(3)).T
+    matrix = LAYOUT.to_message_axes(np.eye(3)).T
     assert np.linalg.det(matrix) == pytest.approx(1.0)
 
 
 def test_axes_mapping_round_trip():
     block = np.arange(12.0).reshape(4, 3)
-    assert np.array_equal(core_from_ros(ros_from_core(block)), block)
+    assert np.array_equal(LAYOUT.to_core_axes(LAYOUT.to_message_axes(block)), block)
 
 
 @given(vectors, vectors)
@@ -79,7 +86,7 @@ def test_single_precision_quaternion_is_normalised():
 
 
 def test_powered_descent_layout_permutes_axes():
-    layout = state_layout("powered_descent", ("x", "y", "z", "vx", "vy", "vz", "mass"))
+    layout = LAYOUT
     assert layout.message_names == ("x", "y", "z", "vx", "vy", "vz", "mass")
     core = np.array([1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0])
     ordered = layout.to_message_order(core)
@@ -88,16 +95,28 @@ def test_powered_descent_layout_permutes_axes():
 
 
 def test_layout_follows_the_core_order():
-    layout = state_layout("powered_descent", ("mass", "vz", "vy", "vx", "z", "y", "x"))
+    names = ("mass", "vz", "vy", "vx", "z", "y", "x")
+    layout = replace(LAYOUT, state_names=names)
     named = dict(zip(layout.message_names, layout.to_message_order(np.arange(7.0)), strict=True))
     assert named == {"mass": 0.0, "vy": 1.0, "vx": 2.0, "vz": 3.0, "y": 4.0, "x": 5.0, "z": 6.0}
 
 
 def test_layout_refuses_other_states():
     with pytest.raises(InvalidInputError, match="powered_descent"):
-        state_layout("powered_descent", ("x", "y"))
+        replace(LAYOUT, state_names=("x", "y"))
 
 
 def test_other_problems_keep_their_names():
-    layout = state_layout("orbit", ("r", "longitude"))
+    layout = orbit("r", "longitude")
+    assert layout.joint_names == ("r", "longitude", "thrust")
     assert layout.to_message_order(np.array([[1.0, 2.0]])).tolist() == [[1.0, 2.0]]
+
+
+def test_a_name_for_two_things_is_refused():
+    with pytest.raises(InvalidInputError, match=r"names in messages of orbit.*thrust"):
+        orbit("r", "thrust")
+
+
+def test_odometry_has_to_be_the_state():
+    with pytest.raises(InvalidInputError, match="odometry of orbit"):
+        orbit("x", "y", "z", "vx", "vy", "vz", "charge", odometry=Odometry())

@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 from adapter_cases import LAYOUT
 
-from msg_adapters.frames import state_layout
+from msg_adapters.layout import StateLayout
 from msg_adapters.parameters import parameter_to_core_axes, parameter_to_message_axes
 
 
@@ -21,6 +21,7 @@ def test_vectors_follow_axes_or_state(core, message):
 
 
 def test_vectors_of_other_problems_stay_as_they_are():
-    layout = state_layout("orbit", ("r", "longitude", "latitude", "speed"))
+    names = ("r", "longitude", "latitude", "speed")
+    layout = StateLayout("orbit", names, names, names)
     assert parameter_to_message_axes(layout, [1.0, 2.0, 3.0]) == [1.0, 2.0, 3.0]
     assert parameter_to_core_axes(layout, [1.0, 2.0, 3.0, 4.0]) == [1.0, 2.0, 3.0, 4.0]

@@ -33,7 +33,8 @@ from msg_adapters.report_message import level_of, message_from_report, report_fr
 
 STAMPS = st.integers(0, 2**31 * 1_000_000_000 - 1)
 TEXT = st.text(string.printable, max_size=20)
-NUMBERS = st.none() | st.floats(allow_nan=False, allow_infinity=False)
+FINITE = st.floats(allow_nan=False, allow_infinity=False)
+NUMBERS = st.none() | FINITE
 COUNTS = st.integers(0, 2**63)
 
 attempts = st.builds(
@@ -70,9 +71,7 @@ certificates = st.builds(
     CertificateFigures,
     passed=st.booleans(),
     reasons=st.lists(TEXT, max_size=3).map(tuple),
-    miss_position_m=NUMBERS,
-    miss_speed_m_s=NUMBERS,
-    mass_used_kg=NUMBERS,
+    values=st.dictionaries(TEXT.map("miss_{}".format), FINITE, max_size=4),
     checks=st.lists(checks, max_size=3).map(tuple),
 )
 reports = st.builds(
@@ -181,13 +180,11 @@ def test_certificate_becomes_figures():
         hold=ControlHold.MEAN,
         mass_used_kg=6000.0,
     )
-    figures = figures_from_certificate(certificate)
+    figures = figures_from_certificate(certificate, ("miss_position", "miss_speed"))
     assert figures == CertificateFigures(
         False,
         ("glideslope",),
-        0.5,
-        0.25,
-        6000.0,
+        {"miss_position_m": 0.5, "miss_speed_m_s": 0.25, "mass_used_kg": 6000.0},
         (
             CheckFigures("miss_position", 0.5, 1.0, "m", 32.0, True),
             CheckFigures("miss_speed", 0.25, 0.5, "m/s", 32.0, True),
@@ -231,7 +228,7 @@ FULL = PlanReport(
     problem="powered_descent",
     input_stamp_ns=5,
     attempt=attempt_from_outcome(outcome(), 0.1),
-    certificate=CertificateFigures(True, (), 1.0, 1.0, 1.0),
+    certificate=CertificateFigures(True, (), {"miss_position_m": 1.0}),
 )
 
 

@@ -16,17 +16,12 @@ from rclpy.serialization import deserialize_message, serialize_message
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import JointState
 
+from dscp_core.problems.powered_descent.messages import LANDING_FRAME, DescentLimits
 from msg_adapters.errors import InputCode, RejectedInputError
 from msg_adapters.joint_state import joint_state_from_state, state_from_joint_state
 from msg_adapters.mass import inertia_from_mass, mass_from_inertia
 from msg_adapters.odometry import kinematics_from_odometry, odometry_from_kinematics
-from msg_adapters.state import (
-    InputLimits,
-    Kinematics,
-    StampedMass,
-    StampedState,
-    state_from_kinematics,
-)
+from msg_adapters.state import Kinematics, StampedMass, StampedState, state_from_kinematics
 
 STAMP_NS = 7_000_000_123
 ALL_FLOATS = st.floats(width=64)
@@ -39,7 +34,7 @@ def kinematics(position=(10.0, -20.0, 300.0), velocity=(1.0, 2.0, -30.0)) -> Kin
 
 
 def odometry() -> Odometry:
-    return odometry_from_kinematics(kinematics())
+    return odometry_from_kinematics(kinematics(), frame=LANDING_FRAME)
 
 
 def joint_state() -> JointState:
@@ -70,8 +65,10 @@ def through_the_wire(message):
 def test_odometry_round_trip(position, velocity, rotation_vector, stamp_ns):
     given_kinematics = Kinematics(stamp_ns, np.array(position), np.array(velocity))
     attitude = Rotation.from_rotvec(rotation_vector).as_quat()
-    message = through_the_wire(odometry_from_kinematics(given_kinematics, attitude=attitude))
-    result = kinematics_from_odometry(message)
+    message = through_the_wire(
+        odometry_from_kinematics(given_kinematics, frame=LANDING_FRAME, attitude=attitude)
+    )
+    result = kinematics_from_odometry(message, LAYOUT)
     assert result.stamp_ns == stamp_ns
     assert np.array_equal(result.position_m, given_kinematics.position_m)
     # There and back by two rotations: a few roundings of the largest component.
@@ -86,7 +83,7 @@ def test_twist_is_rotated_from_the_child_frame():
     orientation.x, orientation.y, orientation.z, orientation.w = map(float, (x, y, z, w))
     linear = message.twist.twist.linear
     linear.x, linear.y, linear.z = -50.0, 3.0, 4.0
-    velocity = kinematics_from_odometry(message).velocity_m_s
+    velocity = kinematics_from_odometry(message, LAYOUT).velocity_m_s
     assert velocity == pytest.approx([-4.0, 3.0, -50.0], abs=1e-12)
 
 
@@ -96,11 +93,11 @@ def test_twist_in_the_landing_frame_is_taken_as_it_is():
     message.pose.pose.orientation.w = 0.0  # no attitude at all: it is not needed
     linear = message.twist.twist.linear
     linear.x, linear.y, linear.z = 1.0, 2.0, 3.0
-    assert kinematics_from_odometry(message).velocity_m_s.tolist() == [1.0, 2.0, 3.0]
+    assert kinematics_from_odometry(message, LAYOUT).velocity_m_s.tolist() == [1.0, 2.0, 3.0]
 
 
 def test_odometry_becomes_a_core_state():
-    state = state_from_kinematics(kinematics_from_odometry(odometry()), 1500.0, LAYOUT)
+    state = state_from_kinematics(kinematics_from_odometry(odometry(), LAYOUT), 1500.0, LAYOUT)
     assert state.values.tolist() == [300.0, 10.0, -20.0, -30.0, 1.0, 2.0, 1500.0]
 
 
@@ -132,7 +129,7 @@ def set_path(message, path, value):
 def test_bad_odometry_is_refused_by_its_number(path, value, code):
     message = odometry()
     set_path(message, path, value)
-    error = refusal(kinematics_from_odometry, message)
+    error = refusal(kinematics_from_odometry, message, LAYOUT)
     assert error.code is code
     assert path.split(".")[-1] in error.field or path.split(".")[-2] in error.field
     assert str(code.value) in str(error)
@@ -143,17 +140,17 @@ def test_finite_comes_before_frame_before_range():
     message = odometry()
     message.header.frame_id = "map"
     message.pose.pose.position.z = -100.0
-    assert refusal(kinematics_from_odometry, message).code is InputCode.WRONG_FRAME
+    assert refusal(kinematics_from_odometry, message, LAYOUT).code is InputCode.WRONG_FRAME
     message.twist.twist.linear.x = math.nan
-    assert refusal(kinematics_from_odometry, message).code is InputCode.NOT_FINITE
+    assert refusal(kinematics_from_odometry, message, LAYOUT).code is InputCode.NOT_FINITE
 
 
 def test_noise_below_ground_is_within_the_tolerance():
     message = odometry()
     message.pose.pose.position.z = -0.4
-    assert kinematics_from_odometry(message).position_m[2] == -0.4
-    strict = InputLimits(ground_tolerance_m=0.1)
-    error = refusal(kinematics_from_odometry, message, limits=strict)
+    assert kinematics_from_odometry(message, LAYOUT).position_m[2] == -0.4
+    strict = DescentLimits(ground_tolerance_m=0.1)
+    error = refusal(kinematics_from_odometry, message, LAYOUT, limits=strict.admit)
     assert error.code is InputCode.BELOW_GROUND
     assert error.value == -0.4
 
@@ -172,16 +169,16 @@ def test_no_float_gets_past_the_checks_of_odometry(numbers, frame, child_frame):
     linear.x, linear.y, linear.z = numbers[3:6]
     orientation.x, orientation.y, orientation.z, orientation.w = numbers[6:]
     try:
-        result = kinematics_from_odometry(message)
+        result = kinematics_from_odometry(message, LAYOUT)
     except RejectedInputError:
         return
     assert np.all(np.isfinite(result.position_m))
-    assert np.linalg.norm(result.velocity_m_s) <= InputLimits().speed_max_m_s * (1 + 1e-12)
+    assert np.linalg.norm(result.velocity_m_s) <= DescentLimits().speed_max_m_s * (1 + 1e-12)
 
 
 def test_a_broken_velocity_is_not_written():
     bad = kinematics(velocity=(0.0, math.nan, 0.0))
-    assert refusal(odometry_from_kinematics, bad).code is InputCode.NOT_FINITE
+    assert refusal(odometry_from_kinematics, bad, frame=LANDING_FRAME).code is InputCode.NOT_FINITE
 
 
 # --- InertiaStamped

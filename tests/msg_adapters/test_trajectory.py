@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from adapter_cases import CONTROL_NAMES, CONTROL_STATES, LAYOUT, STAMP_NS, example_plan
+from adapter_cases import LAYOUT, STAMP_NS, example_plan
 from hypothesis import given
 from hypothesis import strategies as st
 from rclpy.serialization import deserialize_message, serialize_message
@@ -24,9 +24,7 @@ def message() -> JointTrajectory:
 
 
 def decode(trajectory: JointTrajectory):
-    return plan_from_trajectory(
-        trajectory, LAYOUT, control_names=CONTROL_NAMES, control_states=CONTROL_STATES
-    )
+    return plan_from_trajectory(trajectory, LAYOUT)
 
 
 def refusal(trajectory: JointTrajectory) -> RejectedInputError:

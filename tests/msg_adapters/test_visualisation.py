@@ -5,22 +5,31 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from adapter_cases import STAMP_NS, example_plan
+from adapter_cases import STAMP_NS, example_plan, points_from_path
 from nav_msgs.msg import Path
 from rclpy.serialization import deserialize_message, serialize_message
 from visualization_msgs.msg import Marker, MarkerArray
 
 from dscp_core.errors import InvalidInputError
-from msg_adapters.drawing import no_markers
+from dscp_core.problems.powered_descent.messages import LANDING_FRAME
+from dscp_core.problems.powered_descent.scene import DescentStyle, descent_scene
+from msg_adapters.drawing import Drawing, no_markers
 from msg_adapters.errors import InputCode, RejectedInputError
-from msg_adapters.visualisation import (
-    MarkerStyle,
-    markers_from_plan,
-    path_from_plan,
-    points_from_path,
-)
 
-STYLE = MarkerStyle(thrust_arrow_m=50.0, line_width_m=2.0, glideslope_angle_rad=math.radians(60.0))
+STYLE = DescentStyle(thrust_arrow_m=50.0, line_width_m=2.0, glideslope_angle_rad=math.radians(60.0))
+
+
+def path_from_plan(plan, stamp_ns):
+    return draw(plan, stamp_ns, STYLE)[0]
+
+
+def markers_from_plan(plan, stamp_ns, style):
+    return draw(plan, stamp_ns, style)[1]
+
+
+def draw(plan, stamp_ns, style):
+    drawing = Drawing(lambda plan, *_: descent_scene(plan, style), {}, {})
+    return drawing.draw(plan, stamp_ns, frame=LANDING_FRAME)
 
 
 def vector(point):

@@ -20,27 +20,16 @@ from ros.planner_support import (
     start,
 )
 
+from dscp_core import problems
+from dscp_core.problems.entry.messages import PLANET_FRAME
 from dscp_ros.planner.node import PlannerNode
 from dscp_ros.planner.parameter_files import ParameterArguments
-from msg_adapters.frames import PLANET_FRAME, StateLayout, state_layout
 from msg_adapters.joint_state import joint_state_from_state
+from msg_adapters.layout import StateLayout, problem_layout
 from msg_adapters.report import PlanReport
 from msg_adapters.state import StampedState
 
-LAYOUT: StateLayout = state_layout(
-    "entry",
-    (
-        "radius",
-        "longitude",
-        "latitude",
-        "speed",
-        "flight_path_angle",
-        "heading",
-        "angle_of_attack",
-        "bank_angle",
-    ),
-)
-CONTROLS = {"control_names": ("angle_of_attack_rate", "bank_rate"), "control_states": (6, 7)}
+LAYOUT: StateLayout = problem_layout(problems.get("entry"))
 # The paper's case.
 STATE = np.array([6449.1e3, 0.0, 0.0, 6700.0, 0.0, math.radians(90.0), math.radians(30.0), 0.0])
 PATIENT_ENTRY = {name: value for name, value in PATIENT.items() if name != "mass_max_age_s"}

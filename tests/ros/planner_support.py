@@ -24,16 +24,17 @@ from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory
 from visualization_msgs.msg import MarkerArray
 
+from dscp_core import problems
 from dscp_ros.planner.node import PlannerNode
 from dscp_ros.planner.parameter_files import ParameterArguments
-from msg_adapters.frames import StateLayout, state_layout
 from msg_adapters.joint_state import joint_state_from_state
+from msg_adapters.layout import StateLayout, problem_layout
 from msg_adapters.report import PlanReport
 from msg_adapters.report_message import report_from_message
 from msg_adapters.state import StampedState
 
 ROOT = FilePath(__file__).resolve().parents[2]
-LAYOUT: StateLayout = state_layout("powered_descent", ("x", "y", "z", "vx", "vy", "vz", "mass"))
+LAYOUT: StateLayout = problem_layout(problems.get("powered_descent"))
 # The paper's case, core axes (x up).
 STATE = np.array([5000.0, 500.0, 500.0, -150.0, 30.0, -30.0, 38000.0])
 # 300 m up, falling at 150 m/s: 11 g would be needed, the engine gives 2.

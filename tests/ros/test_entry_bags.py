@@ -17,11 +17,10 @@ from ros.entry_support import LAYOUT
 
 from dscp_core.planning.plan import PlanStatus
 from dscp_core.planning.planner import Planner
+from dscp_core.problems.entry.messages import PLANET_FRAME, EntryLimits
 from dscp_ros.bag import BagReader
 from dscp_ros.planner.input_checks import InputGate, InputSettings
-from msg_adapters.entry_state import EntryLimits
 from msg_adapters.errors import RejectedInputError
-from msg_adapters.frames import PLANET_FRAME
 from msg_adapters.state import StampedState
 
 FOLDER = Path(__file__).resolve().parents[2] / "bags"
@@ -29,7 +28,7 @@ NOMINAL, DISPERSED = "entry_nominal", "entry_dispersed"
 STATE, STORY = "/planner/vehicle_state", "/story"
 FAULT_ROW = re.compile(r"^\| (\d+) \| .* \| `(\w+)` \((\d+)\) \|$", re.MULTILINE)
 NUMBER = re.compile(r"[-+]?\d+(\.\d+)?")
-INPUTS = InputSettings(frame=PLANET_FRAME, limits=EntryLimits())
+INPUTS = InputSettings(frame=PLANET_FRAME, limits=EntryLimits().admit)
 
 
 def section(bag: str) -> str:

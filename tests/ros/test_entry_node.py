@@ -11,7 +11,6 @@ import yaml
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from ros.entry_support import (
-    CONTROLS,
     LAYOUT,
     STATE,
     local_entry_planner,
@@ -24,14 +23,14 @@ from dscp_core import problems
 from dscp_core.errors import InvalidInputError
 from dscp_core.planning.certificate import PlanVerifier
 from dscp_core.planning.plan import PlanStatus
+from dscp_core.problems.entry.messages import PLANET_FRAME
+from dscp_core.problems.entry.planet import planet_fixed
 from dscp_ros.planner.node import PlannerNode
 from dscp_ros.planner.parameter_files import ParameterArguments
 from dscp_ros.planner.parameters import parameter_table
 from msg_adapters.errors import InputCode
-from msg_adapters.frames import PLANET_FRAME
 from msg_adapters.joint_state import joint_state_from_state
 from msg_adapters.path import poses_from_path
-from msg_adapters.planet import planet_fixed
 from msg_adapters.state import StampedState
 from msg_adapters.trajectory import plan_from_trajectory
 
@@ -41,7 +40,7 @@ PATH_CHECKS = {"dynamic_pressure_max", "heat_rate_max", "load_factor_max", "bank
 
 
 def decoded(message):
-    return plan_from_trajectory(message, LAYOUT, frame=PLANET_FRAME, **CONTROLS)
+    return plan_from_trajectory(message, LAYOUT, frame=PLANET_FRAME)
 
 
 def test_an_entry_state_becomes_a_certified_trajectory(ros):

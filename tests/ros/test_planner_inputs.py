@@ -30,7 +30,8 @@ def state(stamp_ns: int):
 
 
 def odometry(stamp_ns: int):
-    return odometry_from_kinematics(Kinematics(stamp_ns, STATE[[1, 2, 0]], STATE[[4, 5, 3]]))
+    kinematics = Kinematics(stamp_ns, STATE[[1, 2, 0]], STATE[[4, 5, 3]])
+    return odometry_from_kinematics(kinematics, frame=LAYOUT.frame)
 
 
 def mass(stamp_ns: int, mass_kg: float = 38000.0):

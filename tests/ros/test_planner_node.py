@@ -7,6 +7,7 @@ import re
 from pathlib import Path
 
 import numpy as np
+from adapter_cases import points_from_path
 from geometry_msgs.msg import InertiaStamped
 from nav_msgs.msg import Odometry
 from rcl_interfaces.msg import Log
@@ -34,12 +35,7 @@ from msg_adapters.mass import inertia_from_mass
 from msg_adapters.odometry import odometry_from_kinematics
 from msg_adapters.state import Kinematics, StampedMass, StampedState
 from msg_adapters.trajectory import plan_from_trajectory
-from msg_adapters.visualisation import points_from_path
 
-CONTROLS = {
-    "control_names": ("thrust_x", "thrust_y", "thrust_z"),
-    "control_states": (3, 4, 5),
-}
 MEMORY_LIMIT_MB = 200
 
 
@@ -47,7 +43,9 @@ def odometry(stamp_ns: int) -> Odometry:
     """The paper's state with a tilted vehicle, so that body and landing axes differ."""
     position, velocity = STATE[[1, 2, 0]], STATE[[4, 5, 3]]
     attitude = Rotation.from_euler("xyz", [20.0, -35.0, 130.0], degrees=True).as_quat()
-    return odometry_from_kinematics(Kinematics(stamp_ns, position, velocity), attitude=attitude)
+    return odometry_from_kinematics(
+        Kinematics(stamp_ns, position, velocity), frame=LAYOUT.frame, attitude=attitude
+    )
 
 
 def test_a_state_becomes_a_certified_trajectory(ros):
@@ -66,7 +64,7 @@ def test_a_state_becomes_a_certified_trajectory(ros):
 
         client.wait_for(lambda: client.trajectories and client.paths and client.markers)
         trajectory = client.trajectories[-1]
-        plan, start_ns = plan_from_trajectory(trajectory, LAYOUT, **CONTROLS)
+        plan, start_ns = plan_from_trajectory(trajectory, LAYOUT)
         assert start_ns == stamp_ns
         # The solver satisfies the initial condition to its own accuracy.
         assert np.allclose(plan.states[0], STATE, rtol=1e-6, atol=1e-3)
@@ -249,7 +247,7 @@ def test_the_next_plan_starts_from_the_last(ros):
         cold = client.report_of(first_ns)
         assert not cold.attempt.warm_started
         client.wait_for(lambda: client.trajectories)
-        plan, _ = plan_from_trajectory(client.trajectories[-1], LAYOUT, **CONTROLS)
+        plan, _ = plan_from_trajectory(client.trajectories[-1], LAYOUT)
         second_ns = now_ns()
         elapsed_s = (second_ns - first_ns) / 1e9
         state = [np.interp(elapsed_s, plan.times_s, column) for column in plan.states.T]

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 import yaml
+from adapter_cases import example_plan
 from ros.planner_support import ROOT
 
 from dscp_core import problems
@@ -20,7 +21,7 @@ from dscp_ros.planner.parameter_files import (
 )
 from dscp_ros.planner.parameters import (
     PROBLEM,
-    formulation_parameter,
+    formulation_parameters,
     node_settings,
     parameter_table,
 )
@@ -150,7 +151,11 @@ def test_unknown_names_come_with_the_near_ones():
 
 
 def test_every_default_is_within_its_bounds():
-    for parameter in (PROBLEM, formulation_parameter(PROBLEM_NAME), *parameter_table(DECLARED)):
+    for parameter in (
+        PROBLEM,
+        *formulation_parameters(problems.formulations(PROBLEM_NAME)),
+        *parameter_table(DECLARED),
+    ):
         parameter.check(parameter.default)
         assert parameter.descriptor().description
 
@@ -170,7 +175,10 @@ def test_vectors_are_given_in_the_landing_frame():
     values = defaults() | {"parameters.final_position": [1.0, 2.0, 30.0]}
     settings = node_settings(DECLARED, values)
     assert settings.planner.parameters["final_position"] == [30.0, 1.0, 2.0]
-    assert settings.markers.apex_m == (1.0, 2.0, 30.0)
+    path, markers = settings.drawing.draw(example_plan(), 0, frame="landing_site")
+    apex = next(m for m in markers.markers if m.ns == "glideslope").points[0]
+    assert (apex.x, apex.y, apex.z) == (1.0, 2.0, 30.0)
+    assert len(path.poses) == len(example_plan().times_s)
 
 
 def test_terminal_time_source_is_a_setting():

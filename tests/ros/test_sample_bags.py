@@ -23,7 +23,7 @@ from dscp_core.planning.planner import Planner, PlannerSettings, TerminalTime
 from dscp_ros.bag import BagReader
 from dscp_ros.planner.input_checks import InputGate, InputSettings
 from msg_adapters.errors import InputCode, RejectedInputError
-from msg_adapters.frames import state_layout
+from msg_adapters.layout import problem_layout
 from msg_adapters.odometry import kinematics_from_odometry
 
 FOLDER = Path(__file__).resolve().parents[2] / "bags"
@@ -36,7 +36,7 @@ TOPIC_ROW = re.compile(r"^\| `(/\S+)` \| `(\S+)` \| (\d+) \|$", re.MULTILINE)
 FAULT_ROW = re.compile(r"^\| (\d+) \| .* \| `(\w+)` \((\d+)\) \|$", re.MULTILINE)
 NUMBER = re.compile(r"-?\d+(\.\d+)?")
 
-LAYOUT = state_layout("powered_descent", ("x", "y", "z", "vx", "vy", "vz", "mass"))
+LAYOUT = problem_layout(problems.get("powered_descent"))
 
 
 def section(bag: str) -> str:
@@ -186,7 +186,7 @@ def test_the_attitude_matters_in_the_nominal_bag() -> None:
     # Ten ticks apart, over which the trapezoid rule is off by less than noise allows; the last
     # message comes less than a tick after the one before.
     for early, late in zip(states[:-11:10], states[10:-1:10], strict=False):
-        a, b = kinematics_from_odometry(early), kinematics_from_odometry(late)
+        a, b = (kinematics_from_odometry(message, LAYOUT) for message in (early, late))
         step_s = (b.stamp_ns - a.stamp_ns) / 1e9
         travelled = b.position_m - a.position_m
         rotated = 0.5 * (a.velocity_m_s + b.velocity_m_s) * step_s

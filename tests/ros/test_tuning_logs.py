@@ -17,14 +17,15 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 
+from dscp_core import problems
 from dscp_core.errors import DscpError, InvalidInputError
 from dscp_ros.bag import BagWriter, Qos
 from dscp_ros.planner.input_checks import InputSettings
 from dscp_ros.tuning.logs import LogContent, read_log, topics_of_node
 from dscp_ros.tuning.sources import check_new, code_version, file_digests
 from dscp_ros.tuning.split import split_by_share, split_given, thin
-from msg_adapters.frames import state_layout
 from msg_adapters.joint_state import joint_state_from_state
+from msg_adapters.layout import problem_layout
 from msg_adapters.report import AttemptFigures, NodeCode, PlanReport
 from msg_adapters.report_message import message_from_report
 from msg_adapters.stamps import stamp_from_nanoseconds
@@ -32,8 +33,8 @@ from msg_adapters.state import StampedState
 
 ROOT = Path(__file__).resolve().parents[2]
 BAGS = ROOT / "bags"
-LAYOUT = state_layout("powered_descent", ("x", "y", "z", "vx", "vy", "vz", "mass"))
-TOPICS = topics_of_node("/planner", {})
+LAYOUT = problem_layout(problems.get("powered_descent"))
+TOPICS = topics_of_node("/planner", {}, LAYOUT)
 STATE = np.array([5000.0, 500.0, 500.0, -150.0, 30.0, -30.0, 38000.0])
 SECOND = 10**9
 START = 1_700_000_000 * SECOND
@@ -195,11 +196,11 @@ def test_other_names_of_node_and_topics(tmp_path: Path) -> None:
     path = write(tmp_path / "bag", entries)
     with pytest.raises(InvalidInputError, match=r"/planner/vehicle_state.*it has: /nav/state"):
         read(path)
-    topics = topics_of_node("/lander/", {"vehicle_state": "/nav/state"})
+    topics = topics_of_node("/lander/", {"vehicle_state": "/nav/state"}, LAYOUT)
     assert topics["mass"] == "/lander/mass"
     assert len(read_log(path, LAYOUT, InputSettings(), topics).states) == 1
     with pytest.raises(InvalidInputError, match="one of state, vehicle_state"):
-        topics_of_node("/planner", {"path": "/x"})
+        topics_of_node("/planner", {"path": "/x"}, LAYOUT)
 
 
 def test_a_topic_of_another_type(tmp_path: Path) -> None:

@@ -24,6 +24,7 @@ from dscp_core.problem.extras import Extras
 from dscp_core.problems.entry.aero_table import read_aerodynamic_table
 from dscp_core.problems.entry.checks import check_parameters, check_printed, check_state
 from dscp_core.problems.entry.guess import rolled_out_guess, terminal_time_guess
+from dscp_core.problems.entry.messages import MESSAGES
 from dscp_core.problems.entry.parameters import PARAMETERS
 from dscp_core.problems.entry.physics import (
     ALPHA,
@@ -46,6 +47,7 @@ if TYPE_CHECKING:
 
     from dscp_core.planning.certificate import PlanCertificate
     from dscp_core.planning.plan import Plan
+    from dscp_core.problem.scene import Scene
 
 NAME = "entry"
 
@@ -289,6 +291,13 @@ def _figure(
     return entry_figure(plan, certificate, parameters, title)
 
 
+def _scene(plan: Plan, parameters: Mapping[str, Any], settings: Mapping[str, Any]) -> Scene:
+    """The scene, read when it is drawn."""
+    from dscp_core.problems.entry.scene import scene_of_settings
+
+    return scene_of_settings(plan, parameters, settings)
+
+
 def entry(formulation: Formulation = Formulation.QUADRATIC) -> OptimalControlProblem:
     """Smooth entry flight with a free terminal time as an optimal control problem.
 
@@ -328,7 +337,7 @@ def entry(formulation: Formulation = Formulation.QUADRATIC) -> OptimalControlPro
         ),
         control_states=(ALPHA, BANK),
         formulation=Formulation.QUADRATIC.value,
-        extras=Extras(figure=_figure),
+        extras=Extras(figure=_figure, messages=MESSAGES, scene=_scene),
     )
     if formulation is Formulation.QUADRATIC:
         return _weighted(quadratic, *_PROXIMAL_WEIGHTS)

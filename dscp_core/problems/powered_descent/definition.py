@@ -31,6 +31,7 @@ from dscp_core.problem.declaration import (
 from dscp_core.problem.extras import Extras
 from dscp_core.problems.loading import ProblemFamily
 from dscp_core.problems.powered_descent.guess import norm, projected_guess, raw_guess
+from dscp_core.problems.powered_descent.messages import MESSAGES
 from dscp_core.problems.powered_descent.parameters import PARAMETERS, THRUST_PROX
 
 if TYPE_CHECKING:
@@ -38,6 +39,7 @@ if TYPE_CHECKING:
 
     from dscp_core.planning.certificate import PlanCertificate
     from dscp_core.planning.plan import Plan
+    from dscp_core.problem.scene import Scene
 
 NAME = "powered_descent"
 
@@ -240,6 +242,13 @@ def _figure(
     return descent_figure(plan, certificate, parameters, title)
 
 
+def _scene(plan: Plan, parameters: Mapping[str, Any], settings: Mapping[str, Any]) -> Scene:
+    """The scene, read when it is drawn."""
+    from dscp_core.problems.powered_descent.scene import scene_of_settings
+
+    return scene_of_settings(plan, parameters, settings)
+
+
 def powered_descent(formulation: Formulation = Formulation.CONVERGENT) -> OptimalControlProblem:
     """Fuel-optimal powered descent as an optimal control problem.
 
@@ -276,7 +285,7 @@ def powered_descent(formulation: Formulation = Formulation.CONVERGENT) -> Optima
         misses=_MISSES,
         control_states=(3, 4, 5),
         formulation=Formulation.CONVERGENT.value,
-        extras=Extras(figure=_figure, network=NETWORK),
+        extras=Extras(figure=_figure, network=NETWORK, messages=MESSAGES, scene=_scene),
     )
     if formulation is Formulation.CONVERGENT:
         return convergent

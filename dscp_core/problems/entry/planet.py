@@ -12,11 +12,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from dscp_core.errors import InvalidInputError
-from msg_adapters.errors import InputCode, RejectedInputError
-from msg_adapters.frames import Array
+
+Array = NDArray[np.float64]
 
 _NAMES = (
     "radius",
@@ -55,13 +56,10 @@ def planet_fixed(state_names: Sequence[str], states: Array) -> PlanetFixed:
 
     Raises:
         InvalidInputError: A state is missing.
-        RejectedInputError: NOT_FINITE.
     """
     names = list(state_names)
     if missing := sorted(set(_NAMES) - set(names)):
         raise InvalidInputError("plan.state_names", names, f"names that include {missing}")
-    if not np.all(np.isfinite(states)):
-        raise RejectedInputError(InputCode.NOT_FINITE, "plan.states", "NaN or infinity", "finite")
     radius, longitude, latitude, climb, heading, attack, bank = (
         states[:, names.index(name)] for name in _NAMES
     )

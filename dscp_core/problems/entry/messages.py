@@ -1,12 +1,22 @@
-"""Range checks of an entry vehicle's state, and its angles turned to one branch."""
+"""Entry in messages: spherical coordinates of a planet-fixed frame, in one message only.
+
+Odometry knows no angle of attack and no bank angle, so it does not tell the state. States are
+checked for their range, and their angles turned to one branch.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
-from msg_adapters.errors import InputCode, RejectedInputError
+from dscp_core.problem.messages import Messages, StateLimit, StateLimitError
+from dscp_core.problem.parameters import Parameter
+
+PLANET_FRAME = "earth"
+"""Default planet-fixed frame (REP 105): origin at the planet's centre, z through the north pole, x
+through longitude zero on the equator."""
 
 _TURN_RAD = 2.0 * math.pi
 
@@ -51,7 +61,7 @@ class EntryLimits:
         """Checked scalars, with longitude and heading turned to their branch.
 
         Raises:
-            RejectedInputError: BELOW_GROUND or OUT_OF_RANGE.
+            StateLimitError: A value is out of range.
         """
         self._check_altitude(named["r"])
         speed_m_s = named["speed"]
@@ -77,7 +87,7 @@ class EntryLimits:
     def _check_altitude(self, radius_m: float) -> None:
         if radius_m < self.planet_radius_m:
             bound = f">= {self.planet_radius_m:.12g} m, the ground"
-            raise RejectedInputError(InputCode.BELOW_GROUND, "r", radius_m, bound)
+            raise StateLimitError(StateLimit.BELOW_GROUND, "r", radius_m, bound)
         highest_m = self.planet_radius_m + self.altitude_max_m
         if not radius_m <= highest_m:
             bound = f"<= {highest_m:.12g} m, {self.altitude_max_m:g} m above the ground"
@@ -96,5 +106,78 @@ def _check_interval(name: str, angle_rad: float, lower_rad: float, upper_rad: fl
         raise _out_of_range(name, angle_rad, f"[{lower_rad:.6g}, {upper_rad:.6g}] rad")
 
 
-def _out_of_range(field: str, value: float, bound: str) -> RejectedInputError:
-    return RejectedInputError(InputCode.OUT_OF_RANGE, field, value, bound)
+def _out_of_range(field: str, value: float, bound: str) -> StateLimitError:
+    return StateLimitError(StateLimit.OUT_OF_RANGE, field, value, bound)
+
+
+def _admit(
+    named: Mapping[str, float], parameters: Mapping[str, Any], settings: Mapping[str, Any]
+) -> dict[str, float]:
+    def own(name: str) -> float:
+        return float(parameters[name])
+
+    limits = EntryLimits(
+        planet_radius_m=own("planet_radius"),
+        altitude_max_m=settings["altitude_max_m"],
+        speed_max_m_s=settings["speed_max_m_s"],
+        angle_of_attack_min_rad=own("angle_of_attack_min"),
+        angle_of_attack_max_rad=own("angle_of_attack_max"),
+        bank_angle_min_rad=own("bank_angle_min"),
+        bank_angle_max_rad=own("bank_angle_max"),
+        longitude_centre_rad=own("final_longitude"),
+        heading_centre_rad=own("final_heading"),
+    )
+    return limits.admit(named)
+
+
+_LIMITS = EntryLimits()
+
+MESSAGES = Messages(
+    states=(
+        ("r", "radius"),
+        ("longitude", "longitude"),
+        ("latitude", "latitude"),
+        ("speed", "speed"),
+        ("flight_path_angle", "flight_path_angle"),
+        ("heading", "heading"),
+        ("angle_of_attack", "angle_of_attack"),
+        ("bank_angle", "bank_angle"),
+    ),
+    controls_are_rates=True,
+    frame=PLANET_FRAME,
+    frame_parameter="planet_frame",
+    frame_description="Frame of states and plans: turns with the planet, origin at its centre, z "
+    "through the north pole, x through longitude zero.",
+    settings=(
+        Parameter(
+            "altitude_max_m",
+            _LIMITS.altitude_max_m,
+            "m",
+            "Altitude beyond which a state is refused: no air to steer by.",
+            1.0,
+            _LIMITS.altitude_max_m,
+        ),
+        Parameter(
+            "speed_max_m_s",
+            _LIMITS.speed_max_m_s,
+            "m/s",
+            "Speed beyond which a state is refused.",
+            100.0,
+            2e4,
+        ),
+        Parameter(
+            "lift_arrow_m", 200e3, "m", "Marker length of the arrows along the lift.", 0.0, 1e7
+        ),
+    ),
+    defaults={
+        # Flown, a plan of 50 intervals misses the target by a kilometre, one of 100 by 0.3 km.
+        "intervals": 100,
+        # The entry problem's own costs 0.1 km of that.
+        "defect_tolerance": 1e-6,
+        # Twice the variables of a landing, and minutes in place of seconds to fly them.
+        "deadline_s": 2.0,
+        # The paper's 1800 s hold at the start of an entry. In flight, what is left may be anything.
+        "parameters.terminal_time_min": 10.0,
+    },
+    admit=_admit,
+)

@@ -1,0 +1,109 @@
+"""What a plan looks like in space, as plain arrays in metres and the axes of messages."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from dscp_core.planning.plan import Plan
+
+Array = NDArray[np.float64]
+
+Colour = tuple[float, float, float, float]
+"""Red, green, blue and opacity, each from 0 to 1."""
+
+PATH_COLOUR: Colour = (0.1, 0.5, 1.0, 1.0)
+ARROW_COLOUR: Colour = (1.0, 0.45, 0.0, 0.9)
+
+
+@dataclass(frozen=True, eq=False)
+class Line:
+    """Line through points (M, 3).
+
+    Attributes:
+        name: Unique name.
+        points: (M, 3).
+        width_m: Its width.
+        colour: Its colour.
+    """
+
+    name: str
+    points: Array
+    width_m: float
+    colour: Colour = PATH_COLOUR
+
+
+@dataclass(frozen=True, eq=False)
+class Arrows:
+    """One arrow per row.
+
+    Attributes:
+        name: Unique name.
+        tails: (M, 3).
+        vectors: (M, 3), from tail to tip.
+        width_m: A line of this width; shafts are twice, heads four times as wide.
+        colour: Their colour.
+    """
+
+    name: str
+    tails: Array
+    vectors: Array
+    width_m: float
+    colour: Colour = ARROW_COLOUR
+
+
+@dataclass(frozen=True, eq=False)
+class Sphere:
+    """Sphere.
+
+    Attributes:
+        name: Unique name.
+        centre: (3,).
+        radius_m: Its radius.
+        colour: Its colour.
+    """
+
+    name: str
+    centre: Array
+    radius_m: float
+    colour: Colour
+
+
+@dataclass(frozen=True, eq=False)
+class Triangles:
+    """Triangles, for example a surface.
+
+    Attributes:
+        name: Unique name.
+        corners: (3 M, 3), three rows per triangle.
+        colour: Their colour.
+    """
+
+    name: str
+    corners: Array
+    colour: Colour
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A plan in space.
+
+    Attributes:
+        positions: (N+1, 3), one per node.
+        attitudes: (N+1, 4) quaternions (x, y, z, w), or None for none.
+        shapes: What is drawn. The names stay from plan to plan, so that a plan's shapes replace
+            those of the plan before.
+    """
+
+    positions: Array
+    attitudes: Array | None = None
+    shapes: tuple[Line | Arrows | Sphere | Triangles, ...] = ()
+
+
+SceneOf = Callable[["Plan", Mapping[str, Any], Mapping[str, Any]], Scene]
+"""Scene of a plan, its parameters by name (SI) and the settings of `Messages` by name."""
