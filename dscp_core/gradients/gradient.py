@@ -127,13 +127,13 @@ class Gradient:
         """What this is the gradient of, of which run, and whether it can be trusted."""
         unit = f" [{self.of.unit}]" if self.of.unit not in ("", "1") else ""
         time = f"{'free, ' if self.free_terminal_time else 'fixed at '}{self.terminal_time_s:.4g} s"
-        run = "feasible, " if self.feasible else "NOT feasible, "
+        run = "feasible, " if self.feasible else "NOT FEASIBLE, "
         if self.converged:
             run += "converged"
         elif self.settled is None and self.stopped is ScpStatus.FIXED_ITERATIONS:
             run += "convergence not tested"
         else:
-            run += "NOT converged"
+            run += "NOT CONVERGED"
         return (
             f"gradient of {self.of.name}, {self.of.symbol}{unit}; {self.method.value}, "
             f"{self.iterations} iterations, terminal time {time}; run {run}: "

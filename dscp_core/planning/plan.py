@@ -127,6 +127,8 @@ class PlanOutcome:
         words, why = _WORDS[self.status], " ".join(self.message.split())
         if self.status not in (PlanStatus.CERTIFIED, PlanStatus.NOT_CERTIFIED):
             return f"{words}: {why}"
+        if self.certificate is not None and self.certificate.reasons:
+            words += f" ({self.certificate.reasons[0]})"
         unit = "" if self.cost_unit == "1" else f" {self.cost_unit}"
         source = self.terminal_time_source.value
         facts = f"terminal time {self.terminal_time_used_s:.4g} s ({source}), cost {self.cost:.7g}"
@@ -138,18 +140,18 @@ class PlanOutcome:
 def _doubt(stopped: ScpStatus | None) -> str:
     """Why a plan's iterations cannot be called converged."""
     if stopped is ScpStatus.FIXED_ITERATIONS:
-        return f"convergence NOT tested ({stopped.value})"
+        return f"convergence NOT TESTED ({stopped.value})"
     if stopped is ScpStatus.CONVERGED:
-        return "NOT converged (where the iterations stopped, the dynamics do not hold)"
-    return f"NOT converged ({'no iterations' if stopped is None else stopped.value})"
+        return "NOT CONVERGED (where the iterations stopped, the dynamics do not hold)"
+    return f"NOT CONVERGED ({'no iterations' if stopped is None else stopped.value})"
 
 
 _WORDS = {
     PlanStatus.CERTIFIED: "certified",
-    PlanStatus.NOT_CERTIFIED: "NOT certified",
-    PlanStatus.INFEASIBLE: "infeasible",
-    PlanStatus.ITERATION_LIMIT: "no plan (iteration limit)",
-    PlanStatus.DEADLINE: "no plan (deadline)",
-    PlanStatus.SOLVER_FAILURE: "no plan (solver failure)",
-    PlanStatus.INVALID_STATE: "no plan (invalid state)",
+    PlanStatus.NOT_CERTIFIED: "NOT CERTIFIED",
+    PlanStatus.INFEASIBLE: "INFEASIBLE",
+    PlanStatus.ITERATION_LIMIT: "NO PLAN (iteration limit)",
+    PlanStatus.DEADLINE: "NO PLAN (deadline)",
+    PlanStatus.SOLVER_FAILURE: "NO PLAN (solver failure)",
+    PlanStatus.INVALID_STATE: "NO PLAN (invalid state)",
 }

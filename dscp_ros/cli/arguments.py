@@ -25,7 +25,10 @@ MOST_INTERVALS = 2000
 def add_case_arguments(parser: argparse.ArgumentParser) -> None:
     """Declares the options that describe a case."""
     parser.add_argument(
-        "problem", metavar="PROBLEM", help="what to solve: powered_descent or entry"
+        "problem",
+        metavar="PROBLEM",
+        help="what to solve: a known name, or FILE.py:NAME for a problem, or a function that "
+        "returns one, in a Python file, which is run",
     )
     group = parser.add_argument_group("case")
     add_values(group)
@@ -39,19 +42,19 @@ def add_case_arguments(parser: argparse.ArgumentParser) -> None:
         "--free-terminal-time",
         action=argparse.BooleanOptionalAction,
         help="let the solver choose the terminal time; --set terminal_time is then a first guess "
-        "(default: for entry)",
+        "(default: the problem's own)",
     )
     group.add_argument(
         "--formulation",
         metavar="NAME",
-        help="powered_descent: convergent (default), or printed: the paper's appendix as it "
-        "stands; entry: quadratic (default), printed, or printed_per_second",
+        help="which form of the problem, where it has several (default: the problem's own)",
     )
     group.add_argument(
         "--intervals",
         type=int,
         metavar="N",
-        help=f"time intervals of the trajectory, 2 to {MOST_INTERVALS} (default: 50; entry: 100)",
+        help=f"time intervals of the trajectory, 2 to {MOST_INTERVALS} (default: the problem's "
+        "own)",
     )
     group.add_argument(
         "--solver",

@@ -17,21 +17,23 @@ from dscp_ros.cli.arguments import (
 )
 
 if TYPE_CHECKING:
+    from dscp_core.gradients.quantities import Quantity
+    from dscp_core.problem.declaration import OptimalControlProblem
     from dscp_ros.cli.gradient_report import GradientReport, ParameterGradient
 
 DESCRIPTION = """\
 Differentiates a plan with respect to parameters of the vehicle, the mission or the algorithm.
 
-  --of final_mass   d m_N / d parameter, kg per unit: positive where more of it saves fuel
-  --of cost         d J / d parameter; for powered_descent J is minus the final mass, in kg, for
-                    entry the integral of gamma^2 + 1.1 (u_1^2 + u_2^2)
+  --of cost         d J / d parameter, in the cost's unit per unit of the parameter
+  --of STATE        d (its final value) / d parameter; final_STATE means the same
   --of convergence  d (sum over k > 1 of |J_k - J_K|) / d parameter: how fast the iterations settle
 
 Methods:
   unrolled   exact derivative of the K iterations (K: those to convergence, or --iterations)
   implicit   derivative of the point that they converge to, whatever the way there
 
-The answer carries a verdict: trusted, or the reasons why not. --check compares with differences of
+The first line says of what, of which run (feasible? converged?), and the verdict: trusted, or the
+reasons why not. --check compares with differences of
 the whole SCP at the same K, extrapolated; its uncertainty tells how much they are worth.
 """
 
@@ -47,10 +49,11 @@ examples:
 
 `dscp gradient powered_descent --list-parameters` lists the names. Units are SI.
 
---json prints one object: gradient, trusted, reasons, and with --check central_difference and
-relative_error; each a number, for a vector parameter an array, and for several NAMEs an object by
-name. A relative error of an array's component is relative to its largest component. null: the
-difference cannot be had, or does not tell the derivative from zero; see notes.
+--json prints one object: headline, gradient, trusted, feasible, converged, reasons, and with
+--check central_difference and relative_error; each of these a number, for a vector parameter an
+array, and for several NAMEs an object by name. A relative error of an array's component is relative
+to its largest component. null: the difference cannot be had, or does not tell the derivative from
+zero; see notes.
 
 exit codes: 0 good, 2 bad input, 3 no plan to differentiate.
 """
@@ -59,7 +62,6 @@ exit codes: 0 good, 2 bad input, 3 no plan to differentiate.
 IMPLICIT_ITERATIONS = 40
 
 
-SYMBOLS = {"final_mass": "m_N", "cost": "J", "convergence": "sum |J_k - J_K|"}
 MOST_ITERATIONS = 1000
 MOST_REASONS_SHOWN = 5
 
@@ -71,7 +73,9 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )
     add_case_arguments(parser)
     group = parser.add_argument_group("gradient")
-    group.add_argument("--of", choices=tuple(SYMBOLS), help="what is differentiated")
+    group.add_argument(
+        "--of", metavar="QUANTITY", help="what is differentiated: cost, convergence, or a state"
+    )
     group.add_argument(
         "--wrt", nargs="+", default=(), metavar="NAME", help="with respect to these parameters"
     )
@@ -112,6 +116,7 @@ def run(args: argparse.Namespace) -> int:
         print_parameters(args)
         return ExitCode.OK
     _require(args)
+    from dscp_core.gradients.gradient import Method
     from dscp_core.scp.scp import ScpOptions
     from dscp_ros.cli.gradient_report import check, differentiate
 
@@ -119,24 +124,25 @@ def run(args: argparse.Namespace) -> int:
     if fixed is None and args.method == "implicit":
         fixed = IMPLICIT_ITERATIONS
     planner = case_planner(args, ScpOptions.for_gradients(fixed_iterations=fixed))
+    of = _quantity(planner.problem, args.of)
     names = tuple(dict.fromkeys(args.wrt))
     for name in names:
         planner.problem.table.slice(name)
     trace = planner.scp.run(planner.check_state(planner.initial_state))
-    report = differentiate(planner.scp, trace, args.of, names, args.method)
+    report = differentiate(planner.scp, trace, of, names, Method(args.method))
     if args.check and report.parameters:
         report = check(planner.scp, trace, report, args.step)
     if args.json:
         print_json({"problem": args.problem, **report.as_dict()})
     else:
-        _print(report, "kg" if args.of == "final_mass" else planner.problem.cost_unit)
+        _print(report)
     return ExitCode.NO_PLAN if report.infeasible else ExitCode.OK
 
 
 def _require(args: argparse.Namespace) -> None:
     """Refuses what can be refused before anything is computed."""
     if args.of is None:
-        raise InvalidInputError("--of", None, f"one of {', '.join(SYMBOLS)}")
+        raise InvalidInputError("--of", None, "cost, convergence, or the name of a state")
     if not args.wrt:
         raise InvalidInputError("--wrt", None, "one name or more; see --list-parameters")
     if args.iterations is not None and not 1 <= args.iterations <= MOST_ITERATIONS:
@@ -147,12 +153,26 @@ def _require(args: argparse.Namespace) -> None:
         raise InvalidInputError("--step", args.step, "--check beside it")
 
 
-def _print(report: GradientReport, unit: str) -> None:
-    """Prints the report of a scalar of this unit."""
-    verdict = "trusted" if report.trusted else "NOT TRUSTED"
-    print(f"gradient of {report.of}, {report.method}, {report.iterations} iterations: {verdict}")
-    if report.value is not None:
-        print(f"  {SYMBOLS[report.of]} = {report.value:.9g} {_shown(unit)}".rstrip())
+def _quantity(problem: OptimalControlProblem, text: str) -> Quantity:
+    """What ``--of`` means for a problem.
+
+    Raises:
+        InvalidInputError: Nothing.
+    """
+    from dscp_core.gradients.quantities import quantity
+
+    try:
+        return quantity(problem, text)
+    except InvalidInputError as error:
+        raise InvalidInputError("--of", text, error.bound) from None
+
+
+def _print(report: GradientReport) -> None:
+    """Prints the report."""
+    print(report.headline)
+    unit = report.of.unit
+    if report.gradient is not None:
+        print(f"  {report.of.symbol} = {report.gradient.value:.9g} {_shown(unit)}".rstrip())
     if report.parameters:
         rows = [row for p in report.parameters for row in _rows(p, unit)]
         header = ["parameter", "gradient", ""]
@@ -161,9 +181,11 @@ def _print(report: GradientReport, unit: str) -> None:
         print_table(header, rows, indent="  ")
     for note in report.notes:
         print(f"  note: {note}")
-    for reason in report.reasons[:MOST_REASONS_SHOWN]:
+    # Without a gradient, the headline has said it.
+    reasons = () if report.gradient is None else report.reasons
+    for reason in reasons[:MOST_REASONS_SHOWN]:
         print(f"  reason: {reason}")
-    hidden = len(report.reasons) - MOST_REASONS_SHOWN
+    hidden = len(reasons) - MOST_REASONS_SHOWN
     if hidden > 0:
         print(f"  and {hidden} more reasons; see --json")
 

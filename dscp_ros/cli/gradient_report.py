@@ -7,18 +7,11 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
-import numpy as np
-
 from dscp_core.gradients.differences import Difference, RunDifferences, relative_error
-from dscp_core.gradients.losses import ConvergenceLoss, CostLoss, FinalStateLoss, Loss
-from dscp_core.gradients.run import DifferentiationError, implicit, unrolled
+from dscp_core.gradients.gradient import Gradient, Method
+from dscp_core.gradients.quantities import Quantity
+from dscp_core.gradients.run import DifferentiationError, of_plan
 from dscp_core.scp.scp import Scp, ScpResult, ScpStatus
-
-LOSSES: dict[str, Loss] = {
-    "final_mass": FinalStateLoss("mass", 1.0),
-    "cost": CostLoss(),
-    "convergence": ConvergenceLoss(),
-}
 
 
 @dataclass(frozen=True)
@@ -81,26 +74,49 @@ class GradientReport:
     """A gradient, its verdict and its check.
 
     Attributes:
-        of: What was differentiated, a key of `LOSSES`.
+        of: What was differentiated.
         method: How.
         status: How the iterations ended.
-        infeasible: Whether they ended without a feasible trajectory.
         iterations: Their number K.
-        value: What was differentiated; None without a gradient.
-        trusted: Whether the gradient can be relied upon.
-        reasons: Why not.
+        gradient: The gradient; None where there is none.
+        failure: Why there is none; else empty.
         parameters: Gradients by parameter; empty where there is none.
     """
 
-    of: str
-    method: str
-    status: str
-    infeasible: bool
+    of: Quantity
+    method: Method
+    status: ScpStatus
     iterations: int
-    value: float | None
-    trusted: bool
-    reasons: tuple[str, ...]
+    gradient: Gradient | None
+    failure: str
     parameters: tuple[ParameterGradient, ...]
+
+    @property
+    def infeasible(self) -> bool:
+        """Whether the iterations ended without a feasible trajectory, or the way to one was asked.
+
+        A few unrolled iterations that do not satisfy the dynamics yet have a gradient all the same.
+        """
+        if self.gradient is None or self.status is ScpStatus.INFEASIBLE:
+            return True
+        return self.method is Method.IMPLICIT and not self.gradient.feasible
+
+    @property
+    def trusted(self) -> bool:
+        """Whether the gradient can be relied upon."""
+        return self.gradient is not None and self.gradient.trusted
+
+    @property
+    def reasons(self) -> tuple[str, ...]:
+        """Why not."""
+        return (self.failure,) if self.gradient is None else self.gradient.reasons
+
+    @property
+    def headline(self) -> str:
+        """The gradient of what, of which run, and whether it can be trusted, in one line."""
+        if self.gradient is not None:
+            return self.gradient.headline
+        return f"NO GRADIENT of {self.of.name}: {' '.join(self.failure.split())}"
 
     @property
     def notes(self) -> list[str]:
@@ -109,14 +125,23 @@ class GradientReport:
 
     def as_dict(self) -> dict[str, Any]:
         """The report by name, for JSON."""
+        gradient = self.gradient
         report: dict[str, Any] = {
-            "of": self.of,
+            "headline": self.headline,
+            "of": self.of.name,
+            "unit": self.of.unit,
             "wrt": [p.name for p in self.parameters],
             "units": {p.name: p.unit for p in self.parameters},
             "method": self.method,
-            "status": self.status,
+            "status": "infeasible" if self.infeasible and gradient else self.status,
+            "feasible": gradient is not None and gradient.feasible,
+            "converged": gradient is not None and gradient.converged,
             "iterations": self.iterations,
-            "value": self.value,
+            "terminal_time_s": None if gradient is None else gradient.terminal_time_s,
+            "terminal_time_source": None
+            if gradient is None
+            else ("free" if gradient.free_terminal_time else "fixed"),
+            "value": None if gradient is None else gradient.value,
             "gradient": self._by_name(lambda p: p.shaped(p.values)),
             "trusted": self.trusted,
             "reasons": self.reasons,
@@ -141,42 +166,25 @@ class GradientReport:
 
 
 def differentiate(
-    scp: Scp, trace: ScpResult, of: str, names: Sequence[str], method: str
+    scp: Scp, trace: ScpResult, of: Quantity, names: Sequence[str], method: Method
 ) -> GradientReport:
     """Gradient of a run.
 
     Args:
         scp: The loop that made the trace, with options for gradients.
         trace: Its result.
-        of: Key of `LOSSES`.
+        of: What of it.
         names: Parameters.
-        method: ``"unrolled"`` or ``"implicit"``.
+        method: How.
 
     Raises:
         InvalidInputError: Unknown name, or a quantity that the method cannot differentiate.
     """
-    infeasible = _infeasible(scp, trace, method)
-    report = GradientReport(
-        of=of,
-        method=method,
-        status="infeasible" if infeasible else trace.status.name.lower(),
-        infeasible=infeasible,
-        iterations=len(trace.iterations),
-        value=None,
-        trusted=False,
-        reasons=(),
-        parameters=(),
-    )
-    compute = unrolled if method == "unrolled" else implicit
+    gradient, failure = None, ""
     try:
-        gradient = compute(scp, trace, LOSSES[of])
+        gradient = of_plan(scp, trace, of.loss, method)
     except DifferentiationError as error:
-        return replace(report, infeasible=True, reasons=(str(error),))
-    reasons = gradient.reasons
-    if infeasible:
-        reasons += (f"no feasible trajectory: {trace.message}",)
-    elif trace.status is ScpStatus.ITERATION_LIMIT:
-        reasons += (f"not converged, so not the gradient of an optimum: {trace.message}",)
+        failure = str(error)
     table = scp.transcription.table
     parameters = tuple(
         ParameterGradient(
@@ -186,13 +194,10 @@ def differentiate(
             tuple(gradient.parameters[table.slice(name)].tolist()),
         )
         for name in names
+        if gradient is not None
     )
-    return replace(
-        report,
-        value=gradient.value,
-        trusted=not reasons,
-        reasons=reasons,
-        parameters=parameters,
+    return GradientReport(
+        of, method, trace.status, len(trace.iterations), gradient, failure, parameters
     )
 
 
@@ -202,7 +207,7 @@ def check(scp: Scp, trace: ScpResult, report: GradientReport, step: float | None
     Raises:
         InvalidInputError: A step that cannot be taken.
     """
-    runs = RunDifferences(scp, trace, LOSSES[report.of])
+    runs = RunDifferences(scp, trace, report.of.loss)
     return replace(
         report,
         parameters=tuple(
@@ -216,17 +221,6 @@ def check(scp: Scp, trace: ScpResult, report: GradientReport, step: float | None
             for p in report.parameters
         ),
     )
-
-
-def _infeasible(scp: Scp, trace: ScpResult, method: str) -> bool:
-    """Whether iterations that were meant to converge left virtual control."""
-    if trace.status in (ScpStatus.INFEASIBLE, ScpStatus.SUBPROBLEM_INFEASIBLE):
-        return True
-    if method != "implicit" or not trace.iterations:
-        return False
-    scale = scp.transcription.layout.state_scale
-    left = float(np.max(np.abs(trace.iterations[-1].virtual_control) / scale))
-    return left > scp.virtual_control_tolerance
 
 
 def _described(difference: Difference) -> dict[str, Any]:

@@ -6,6 +6,7 @@ import contextlib
 import csv
 import json
 import os
+import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -67,8 +68,8 @@ def write_trajectory(
     Raises:
         OSError: The file cannot be written.
     """
-    states = [f"{s.name}_{_unit_suffix(s.unit)}" for s in problem.states]
-    controls = [f"{c.name}_{_unit_suffix(c.unit)}" for c in problem.controls]
+    states = [with_unit(s.name, s.unit) for s in problem.states]
+    controls = [with_unit(c.name, c.unit) for c in problem.controls]
     if path.suffix.lower() == ".csv":
         nodes = zip(
             plan.times_s.tolist(), plan.states.tolist(), plan.controls.tolist(), strict=True
@@ -90,5 +91,7 @@ def write_trajectory(
         partial.write_text(json.dumps(json_ready(content), allow_nan=False), encoding="utf-8")
 
 
-def _unit_suffix(unit: str) -> str:
-    return unit.replace("/", "_").replace("^", "").lower()
+def with_unit(name: str, unit: str) -> str:
+    """A key or column that tells its unit, such as ``speed_m_s``."""
+    suffix = re.sub(r"[^a-z0-9]+", "_", unit.lower().replace("^", "")).strip("_")
+    return name if suffix in ("", "1") else f"{name}_{suffix}"

@@ -18,19 +18,26 @@ from dscp_ros.cli.arguments import (
     print_parameters,
     print_table,
 )
-from dscp_ros.cli.output_files import check_output_path, complete_file, write_trajectory
+from dscp_ros.cli.output_files import (
+    check_output_path,
+    complete_file,
+    with_unit,
+    write_trajectory,
+)
 
 if TYPE_CHECKING:
     from dscp_core.planning.certificate import PlanCertificate
     from dscp_core.planning.plan import Plan, PlanOutcome
     from dscp_core.planning.planner import Planner
+    from dscp_core.problem.declaration import OptimalControlProblem
 
 DESCRIPTION = """\
 Plans one trajectory and certifies it: the true dynamics are integrated under the planned controls,
-and every constraint is checked between the nodes too. Without options it is the paper's case.
+and every constraint is checked between the nodes too. Without options it is the problem's own case.
 
-Units are SI and angles are in rad; in powered_descent x points up. A plan for which no certificate
-can be given is no plan: exit code 3.
+Units are SI and angles are in rad. A plan for which no certificate can be given is no plan: exit
+code 3. The first line says more: a certified plan whose iterations had not converged can be flown,
+but another may cost less.
 """
 
 EPILOG = """\
@@ -43,25 +50,21 @@ examples:
   dscp plan powered_descent --set terminal_time=32 --json    (infeasible: exit code 3)
   dscp plan entry --set surface_to_mass_ratio=0.93 --plot entry.png
   dscp plan entry --formulation printed --intervals 200
+  dscp plan my_problem.py:QUADROTOR --plot quadrotor.png
 
 A vehicle file holds lines such as `initial_mass: 25000` and `initial_velocity: [-90, 0, 0]`.
 
---json prints one object: status (certified, not_certified, infeasible, iteration_limit, deadline,
-solver_failure), message, terminal_time_s, final_mass_kg, iterations, certified, certificate,
-solve_time_ms, solver, virtual_control, max_defect, cost, least_feasible_terminal_time_s.
-null stands for what does not exist.
+--json prints one object: headline, status (certified, not_certified, infeasible, iteration_limit,
+deadline, solver_failure), message, certified, converged, terminal_time_s, iterations, cost,
+cost_unit, final_STATE_UNIT for every state (such as final_mass_kg), certificate (with MISS_UNIT for
+every miss, such as miss_position_m), solve_time_ms, solver, virtual_control, max_defect,
+least_feasible_terminal_time_s. null stands for what does not exist.
 
 exit codes: 0 certified plan, 2 bad input, 3 no such plan.
 """
 
-_STATUS_WORDS = {
-    "certified": "certified",
-    "not_certified": "NOT CERTIFIED",
-    "infeasible": "INFEASIBLE",
-    "iteration_limit": "NO PLAN: iteration limit",
-    "deadline": "NO PLAN: deadline",
-    "solver_failure": "NO PLAN: solver failure",
-}
+# Of states whose final value is not pinned, this many are printed.
+_MOST_FINAL_STATES = 8
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -101,7 +104,7 @@ def run(args: argparse.Namespace) -> int:
 
     planner = case_planner(args, ScpOptions())
     planner.check_state(planner.initial_state)
-    outcome = planner.plan(planner.initial_state, deadline_s=args.deadline)
+    outcome = planner.plan(deadline_s=args.deadline)
     least = None
     without_answer = outcome.status not in (PlanStatus.CERTIFIED, PlanStatus.DEADLINE)
     if without_answer and planner.settings.terminal_time is not TerminalTime.FREE:
@@ -112,7 +115,7 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         print_json({**described, **written})
     else:
-        _print(described)
+        _print(described, planner, outcome)
     return ExitCode.OK if outcome.status is PlanStatus.CERTIFIED else ExitCode.NO_PLAN
 
 
@@ -124,20 +127,26 @@ def describe(planner: Planner, outcome: PlanOutcome, least_s: float | None) -> d
         outcome: What became of the attempt.
         least_s: Least feasible terminal time, where it was looked for and found.
     """
-    from dscp_core.planning.plan import PlanStatus
-
-    settings, plan = planner.settings, _flyable(outcome)
+    problem, settings, plan = planner.problem, planner.settings, _flyable(outcome)
     return {
-        "problem": planner.problem.name,
-        "formulation": planner.problem.formulation or None,
+        "problem": problem.name,
+        "formulation": problem.formulation or None,
+        "headline": outcome.headline,
         "status": outcome.status,
         "message": outcome.message,
-        "certified": outcome.status is PlanStatus.CERTIFIED,
+        "certified": outcome.certified,
+        "converged": outcome.converged,
         "terminal_time_s": outcome.terminal_time_used_s,
         "terminal_time_source": settings.terminal_time,
         "least_feasible_terminal_time_s": least_s,
-        "final_mass_kg": None if plan is None else _final_mass(plan),
+        **{
+            with_unit(f"final_{state.name}", state.unit): None
+            if plan is None
+            else plan.states[-1, index]
+            for index, state in enumerate(problem.states)
+        },
         "cost": None if plan is None else outcome.cost,
+        "cost_unit": problem.cost_unit,
         "iterations": outcome.iterations,
         "intervals": settings.intervals,
         "solver": outcome.solver,
@@ -145,8 +154,10 @@ def describe(planner: Planner, outcome: PlanOutcome, least_s: float | None) -> d
         "solver_time_ms": 1e3 * outcome.solver_time_s,
         "virtual_control": outcome.virtual_control,
         "max_defect": outcome.max_defect,
-        "certificate": None if outcome.certificate is None else _certificate(outcome.certificate),
-        "parameters": planner.problem.table.unpack(planner.parameters),
+        "certificate": None
+        if outcome.certificate is None
+        else _certificate(problem, outcome.certificate),
+        "parameters": outcome.parameters,
     }
 
 
@@ -198,22 +209,16 @@ def _flyable(outcome: PlanOutcome) -> Plan | None:
     return outcome.plan if kept else None
 
 
-def _final_mass(plan: Plan) -> float | None:
-    """Mass at the end, where it is a state."""
-    if "mass" not in plan.state_names:
-        return None
-    return float(plan.states[-1, plan.state_names.index("mass")])
-
-
-def _certificate(certificate: PlanCertificate) -> dict[str, Any]:
+def _certificate(problem: OptimalControlProblem, certificate: PlanCertificate) -> dict[str, Any]:
     worst = {check.name: check.worst_value for check in certificate.checks}
+    # Missing where the flight could not be integrated to its end.
+    missed = {with_unit(miss.name, miss.unit): worst.get(miss.name) for miss in problem.misses}
+    used = certificate.mass_used_kg
     return {
         "passed": certificate.passed,
         "reasons": certificate.reasons,
-        # Missing where the flight could not be integrated to its end.
-        "miss_position_m": worst.get("miss_position"),
-        "miss_speed_m_s": worst.get("miss_speed"),
-        "mass_used_kg": certificate.mass_used_kg,
+        **missed,
+        **({} if used is None else {"mass_used_kg": used}),
         "control_hold": certificate.hold,
         "checks": [asdict(check) for check in certificate.checks],
     }
@@ -232,53 +237,39 @@ def _write(
     if args.output is not None:
         write_trajectory(args.output, plan, planner.problem, described)
     if args.plot is not None:
-        from dscp_core.planning.histories import plan_figure
-
-        figure = plan_figure(
-            planner.problem,
-            plan,
-            outcome.certificate,
-            planner.problem.table.unpack(planner.parameters),
-        )
+        figure = planner.figure(outcome)
         with complete_file(args.plot) as partial:
             figure.savefig(partial)
     return {name: str(path) for name, path in asked.items()}
 
 
-def _print(described: dict[str, Any]) -> None:
-    status, certificate = described["status"], described["certificate"]
-    form = f"{described['formulation']}, " if described["formulation"] else ""
-    print(
-        f"{described['problem']} ({form}{described['intervals']} intervals): "
-        f"{_STATUS_WORDS[status.name.lower()]}"
-    )
-    rows = [
-        (
-            "terminal time",
-            f"{described['terminal_time_s']:.4f} s",
-            described["terminal_time_source"].value,
-        )
-    ]
+def _print(described: dict[str, Any], planner: Planner, outcome: PlanOutcome) -> None:
+    problem, certificate = planner.problem, described["certificate"]
+    form = f"{problem.formulation}, " if problem.formulation else ""
+    print(f"{problem.name} ({form}{planner.settings.intervals} intervals): {outcome.headline}")
+    source = described["terminal_time_source"].value
+    rows = [("terminal time", f"{outcome.terminal_time_used_s:.4f} s", source)]
     if described["least_feasible_terminal_time_s"] is not None:
         rows.append(("least feasible", f"{described['least_feasible_terminal_time_s']:.4f} s", ""))
-    if described["final_mass_kg"] is not None:
-        used = certificate["mass_used_kg"]
-        rows.append(("final mass", f"{described['final_mass_kg']:.3f} kg", f"{used:.3f} kg used"))
-    elif described["cost"] is not None:
-        rows.append(("cost", f"{described['cost']:.6g}", ""))
-    rows.append(
-        (
-            "iterations",
-            str(described["iterations"]),
-            f"{described['solve_time_ms']:.1f} ms, of which "
-            f"{described['solver_time_ms']:.1f} ms in {described['solver']}",
-        )
-    )
+    plan = _flyable(outcome)
+    if plan is not None:
+        rows.append(("cost", _quantity(outcome.cost, problem.cost_unit), ""))
+        ends = [
+            (state, plan.states[0, i], plan.states[-1, i])
+            for i, state in enumerate(problem.states)
+            if state.name not in problem.final_state
+        ]
+        rows += [
+            (f"final {state.name}", _quantity(end, state.unit), f"{end - start:+.7g} in flight")
+            for state, start, end in ends[:_MOST_FINAL_STATES]
+        ]
+    solver = f", of which {described['solver_time_ms']:.1f} ms in {outcome.solver}"
+    time = f"{described['solve_time_ms']:.1f} ms"
+    rows.append(("iterations", str(outcome.iterations), time + (solver if outcome.solver else "")))
+    widths = [max(len(row[column]) for row in rows) for column in (0, 1)]
     for label, value, note in rows:
-        print(f"  {label:<15}{value:>14}  {note}".rstrip())
-    if status.name != "CERTIFIED":
-        print(f"  {described['message']}")
-    if described["cost"] is None:
+        print(f"  {label:<{widths[0]}}  {value:>{widths[1]}}  {note}".rstrip())
+    if plan is None or certificate is None:
         return
     print("  certificate, flown with the controls held at interval means:")
     checks = [
@@ -292,3 +283,7 @@ def _print(described: dict[str, Any]) -> None:
         for check in certificate["checks"]
     ]
     print_table(("check", "worst", "bound", "at", ""), checks, indent="    ")
+
+
+def _quantity(value: float, unit: str) -> str:
+    return f"{value:.8g}" + ("" if unit in ("", "1") else f" {unit}")

@@ -38,6 +38,8 @@ def test_final_mass_over_terminal_time(gradient: Any, time_s: float, sign: float
     )
     assert code == ExitCode.OK
     assert answer["trusted"] is True
+    assert (answer["feasible"], answer["converged"]) == (True, True)
+    assert f"terminal time fixed at {time_s} s; run feasible, converged" in answer["headline"]
     assert answer["reasons"] == []
     assert answer["method"] == "unrolled"
     # More time saves fuel before the optimum at 32.81 s and costs fuel after it.
@@ -56,6 +58,17 @@ def test_vector_parameter_component_by_component(gradient: Any) -> None:
     up, y, z = answer["gradient"]
     assert y < 0.0 < z
     assert up == pytest.approx(answer["central_difference"][0], rel=ERROR)
+
+
+def test_the_final_value_of_any_state(gradient: Any) -> None:
+    case = ("--wrt", "initial_mass", "--iterations", "5")
+    _, by_state = gradient("--of", "mass", *case)
+    _, by_final = gradient("--of", "final_mass", *case)
+    assert by_state == by_final
+    assert (by_state["of"], by_state["unit"]) == ("final_mass", "kg")
+    code, pinned = gradient("--of", "x", *case)
+    assert code == ExitCode.OK
+    assert pinned["gradient"] == pytest.approx(0.0, abs=1e-9)
 
 
 def test_several_parameters_by_name_and_a_zero_gradient(gradient: Any) -> None:
@@ -95,6 +108,7 @@ def test_weight_at_its_lower_bound_is_checked_from_one_side(gradient: Any) -> No
         *("--iterations", "3", "--intervals", "20"),
     )
     assert code == ExitCode.OK
+    assert "convergence not tested" in answer["headline"]
     assert answer["check"]["trust_region_step"]["kind"] == "forward"
     assert answer["gradient"]["trust_region_step"] == 0.0  # the terminal time is fixed
     largest = max(map(abs, answer["gradient"]["trust_region_control"]))
@@ -126,6 +140,8 @@ def test_infeasible_case_is_not_trusted(gradient: Any) -> None:
         assert code == ExitCode.NO_PLAN
         assert answer["status"] == "infeasible"
         assert answer["trusted"] is False
+        assert (answer["feasible"], answer["converged"]) == (False, False)
+        assert "NOT FEASIBLE, NOT CONVERGED: NOT TRUSTED" in answer["headline"]
         assert any("no feasible trajectory" in reason for reason in answer["reasons"])
 
 
@@ -137,6 +153,7 @@ def test_run_without_a_result_has_no_gradient(gradient: Any) -> None:
     assert answer["gradient"] is None
     assert answer["trusted"] is False
     assert "iteration 1" in answer["reasons"][0]
+    assert answer["headline"].startswith("NO GRADIENT of final_mass: ")
 
 
 def test_unconverged_run_says_so(gradient: Any) -> None:
@@ -145,6 +162,7 @@ def test_unconverged_run_says_so(gradient: Any) -> None:
     assert code == ExitCode.OK
     assert answer["status"] == "iteration_limit"
     assert answer["trusted"] is False
+    assert "NOT CONVERGED: NOT TRUSTED" in answer["headline"]
     assert any("not converged" in reason for reason in answer["reasons"])
 
 
@@ -156,6 +174,7 @@ MASS = ["--of", "final_mass"]
     [
         (["--of", "final_mass"], "--wrt"),
         (["--wrt", "gravity"], "--of"),
+        (["--of", "fuel", "--wrt", "gravity"], "--of"),
         ([*MASS, "--wrt", "gravitation"], "parameter"),
         ([*MASS, "--wrt", "gravity", "--iterations", "0"], "--iterations"),
         ([*MASS, "--wrt", "gravity", "--check", "--step", "0"], "--step"),
@@ -175,7 +194,9 @@ def test_text_for_people(capsys: pytest.CaptureFixture[str]) -> None:
     case = ["--wrt", "initial_position", "--intervals", "20", "--check"]
     assert main(["gradient", "powered_descent", "--of", "final_mass", *case]) == ExitCode.OK
     text = capsys.readouterr().out
-    assert "m_N = 317" in text
+    assert text.splitlines()[0].startswith("gradient of final_mass, mass(t_f) [kg]; unrolled, ")
+    assert text.splitlines()[0].endswith("run feasible, converged: trusted")
+    assert "mass(t_f) = 317" in text
     for component in range(3):
         assert f"initial_position[{component}]" in text
     assert "kg per m" in text

@@ -44,7 +44,8 @@ def test_default_is_the_papers_case(plan: Any) -> None:
     code, answer = plan()
     assert code == ExitCode.OK
     assert answer["status"] == "certified"
-    assert answer["certified"] is True
+    assert (answer["certified"], answer["converged"]) == (True, True)
+    assert answer["headline"].startswith("certified, converged: terminal time 32.81 s (fixed)")
     assert answer["terminal_time_s"] == 32.81
     # 3e-4 s from the optimum cost 3e-6 kg; the rest is the reference's last printed digit.
     assert answer["final_mass_kg"] == pytest.approx(OPTIMAL_MASS_KG, abs=0.006)
@@ -97,6 +98,18 @@ def test_unreachable_target_is_infeasible_without_a_least_time(plan: Any) -> Non
     assert code == ExitCode.NO_PLAN
     assert answer["status"] == "infeasible"
     assert answer["least_feasible_terminal_time_s"] is None
+
+
+def test_a_certified_plan_cut_short_says_that_it_is_not_converged(
+    plan: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    # Steps so short that 20 iterations do not get there.
+    slow = ("--set", "trust_region_control=0.3,0.3,0.3", "--set", "terminal_time=33")
+    code, answer = plan(*slow)
+    assert code == ExitCode.OK
+    assert (answer["certified"], answer["converged"]) == (True, False)
+    assert main(["plan", "powered_descent", *slow]) == ExitCode.OK
+    assert "certified, NOT CONVERGED (iteration limit)" in capsys.readouterr().out.splitlines()[0]
 
 
 def test_deadline_that_is_too_short(plan: Any) -> None:
@@ -245,7 +258,8 @@ def test_parameter_list(capsys: pytest.CaptureFixture[str]) -> None:
 def test_text_for_people(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["plan", "powered_descent"]) == ExitCode.OK
     text = capsys.readouterr().out
-    assert "certified" in text.splitlines()[0]
+    assert "certified, converged" in text.splitlines()[0]
+    assert "final mass" in text
     assert "31760.3" in text
     assert "miss_position" in text
 

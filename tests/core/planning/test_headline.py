@@ -30,7 +30,7 @@ def test_a_certified_plan_at_the_iteration_limit_says_that_it_is_not_converged()
     assert outcome.status is PlanStatus.CERTIFIED
     assert outcome.stopped is ScpStatus.ITERATION_LIMIT
     assert not outcome.converged
-    assert outcome.headline.startswith("certified, NOT converged (iteration limit): ")
+    assert outcome.headline.startswith("certified, NOT CONVERGED (iteration limit): ")
     assert outcome.headline.endswith("which may not be the least")
 
 
@@ -38,7 +38,7 @@ def test_a_fixed_number_of_iterations_is_no_convergence() -> None:
     outcome = planner(fixed_iterations=12).plan()
     assert outcome.certified
     assert not outcome.converged
-    assert "convergence NOT tested" in outcome.headline
+    assert "convergence NOT TESTED" in outcome.headline
 
 
 @pytest.mark.parametrize("limit", [1, 2, 3])
@@ -56,7 +56,7 @@ def test_an_infeasible_case_is_not_called_a_plan() -> None:
     outcome = Planner(problems.get("powered_descent"), parameters={"terminal_time": 31.0}).plan()
     assert outcome.status is PlanStatus.INFEASIBLE
     assert not outcome.converged
-    assert outcome.headline.startswith("infeasible: ")
+    assert outcome.headline.startswith("INFEASIBLE: ")
     assert "\n" not in replace(outcome, message="two\nlines").headline
 
 
@@ -66,13 +66,13 @@ def test_a_refused_state_has_no_iterations() -> None:
     state[0] = -50.0
     outcome = made.plan(state)
     assert outcome.stopped is None
-    assert outcome.headline.startswith("no plan (invalid state): x: got")
+    assert outcome.headline.startswith("NO PLAN (invalid state): x: got")
 
 
 def test_a_deadline_is_named() -> None:
     outcome = planner().plan(deadline_s=1e-4)
     assert not outcome.converged
-    assert outcome.headline.startswith("no plan (deadline): ")
+    assert outcome.headline.startswith("NO PLAN (deadline): ")
 
 
 def test_the_outcome_says_what_it_was_planned_with() -> None:

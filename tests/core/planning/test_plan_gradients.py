@@ -206,7 +206,7 @@ def test_a_gradient_without_a_feasible_plan_is_not_trusted() -> None:
         assert not gradient.feasible
         assert not gradient.converged
         assert any("no feasible trajectory" in reason for reason in gradient.reasons)
-        assert "NOT feasible, NOT converged: NOT TRUSTED" in gradient.headline
+        assert "NOT FEASIBLE, NOT CONVERGED: NOT TRUSTED" in gradient.headline
 
 
 def test_a_plan_cut_short_is_not_what_is_differentiated() -> None:
