@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -21,8 +21,9 @@ from dscp_core.planning.attempt import Attempt, Start
 from dscp_core.planning.certificate import PlanVerifier
 from dscp_core.planning.differentiation import differentiable, plan_gradient, suited_method
 from dscp_core.planning.plan import Plan, PlanOutcome, PlanStatus, TerminalTime
+from dscp_core.planning.remainder import Remainder
 from dscp_core.planning.settings import PlannerSettings, TerminalTimePredictor
-from dscp_core.problem.declaration import TERMINAL_TIME, OptimalControlProblem
+from dscp_core.problem.declaration import TERMINAL_TIME, OptimalControlProblem, named
 from dscp_core.problem.parameters import Value
 from dscp_core.scp.scp import Scp, ScpStatus
 from dscp_core.transcription.transcription import Transcription
@@ -35,37 +36,6 @@ if TYPE_CHECKING:
 __all__ = ["Planner", "PlannerSettings", "TerminalTime", "TerminalTimePredictor"]
 
 Array = NDArray[np.float64]
-
-# Of a plan's flight time; with less than this left, its grid is too coarse to start from.
-_LEAST_REMAINING = 0.05
-
-# Greatest distance of a state from a plan to start from that, in units of the states' scales.
-# Farther away, iterations take longer than from none, with a predicted terminal time sooner: in a
-# box about the paper's case, 6.2 against 6.2 at 0.05 and 6.5 against 5.0 at 0.1; with a free one,
-# 4.9 against 5.2 at 0.1 and 5.7 against 5.5 at 0.2. A fixed one stays that of the plan anyway.
-_NEAR = {TerminalTime.PREDICTED: 0.05, TerminalTime.FREE: 0.2, TerminalTime.FIXED: math.inf}
-
-
-@dataclass(frozen=True)
-class _Remainder:
-    """What is left of a plan: from ``elapsed_s`` on, for ``seconds``.
-
-    Attributes:
-        plan: The plan.
-        elapsed_s: From its start.
-        seconds: To its end.
-        distance: Of the state to plan from, in units of the states' scales.
-    """
-
-    plan: Plan
-    elapsed_s: float
-    seconds: float
-    distance: float
-
-    def helps(self, source: TerminalTime) -> bool:
-        """Whether it is a start, with a terminal time from this source."""
-        return self.distance <= _NEAR[source]
-
 
 _FINAL = (PlanStatus.CERTIFIED, PlanStatus.DEADLINE)
 """After these there is no reason, or no time, for another start."""
@@ -124,9 +94,9 @@ class Planner:
         self._verifier = PlanVerifier(self.problem, settings.intervals, hold=settings.hold)
         self._time = self.problem.table.slice(TERMINAL_TIME)
         self._time_bounds = self._bounds_of_time()
-        self._state_slices = [
-            self.problem.table.slice(name) for name in self.problem.initial_state_parameters
-        ]
+        packed = ca.SX.sym("p", self.problem.table.size)
+        start = self.problem.initial_state(named(self.problem, packed))
+        self._start = ca.Function("initial_state", [packed], [start])
 
     def _loop(self, *, free: bool) -> Scp:
         transcription = Transcription(
@@ -150,7 +120,10 @@ class Planner:
     @property
     def initial_state(self) -> Array:
         """Initial state of the settings' parameters, (nx,), SI."""
-        return np.concatenate([self.parameters[part] for part in self._state_slices])
+        return self._initial_state(self.parameters)
+
+    def _initial_state(self, packed: Array) -> Array:
+        return np.asarray(self._start(packed), dtype=np.float64).ravel()
 
     def check_state(self, state: Array) -> Array:
         """Packed parameters with this initial state.
@@ -159,7 +132,8 @@ class Planner:
             state: (nx,), SI, in the order of `state_names`.
 
         Raises:
-            InvalidInputError: Wrong length, not finite, out of bounds, or below ground.
+            InvalidInputError: Wrong length, not finite, out of bounds, refused by the problem, or
+                another than the problem's own where no parameters hold it.
         """
         state = np.asarray(state, dtype=np.float64)
         if state.shape != (len(self.problem.states),):
@@ -171,6 +145,11 @@ class Planner:
                 raise InvalidInputError(name, float(value), "finite")
         table = self.problem.table
         packed = table.pack(self.problem.initial_state_values(state), base=self.parameters)
+        given = self._initial_state(packed)
+        if np.any(np.abs(given - state) > 1e-9 * self.transcription.layout.state_scale):
+            raise InvalidInputError(
+                "state", state.tolist(), f"{given.tolist()}: no initial_state_parameters hold it"
+            )
         if self.problem.check_state is not None:
             self.problem.check_state(state, table.unpack(packed))
         return packed
@@ -203,7 +182,8 @@ class Planner:
             packed = self.check_state(state)
         except InvalidInputError as error:
             return attempt.invalid(str(error), self.parameters, source)
-        left = self._left(warm_start, elapsed_s, state)
+        layout = self.transcription.layout
+        left = Remainder.of(warm_start, self.problem.name, elapsed_s, state, layout)
         if self._predictor is not None:
             try:
                 attempt.predicted_s = self._predict(self._predictor, state)
@@ -235,17 +215,6 @@ class Planner:
                 break
         return outcome if uncertified is None else attempt.with_all_runs(uncertified)
 
-    def _left(self, plan: Plan | None, elapsed_s: float, state: Array) -> _Remainder | None:
-        """What is left of a plan, where that is enough to start from."""
-        if plan is None or plan.problem != self.problem.name or not elapsed_s >= 0.0:
-            return None
-        seconds = plan.terminal_time_s - elapsed_s
-        if seconds <= _LEAST_REMAINING * plan.terminal_time_s:
-            return None
-        planned = np.array([np.interp(elapsed_s, plan.times_s, x) for x in plan.states.T])
-        scale = self.transcription.layout.state_scale
-        return _Remainder(plan, elapsed_s, seconds, float(np.max(np.abs(state - planned) / scale)))
-
     def _predict(self, predictor: TerminalTimePredictor, state: Array) -> float:
         """Prediction within the bounds of a free terminal time.
 
@@ -260,24 +229,24 @@ class Planner:
         return seconds
 
     def _predicted(
-        self, state: Array, packed: Array, predicted_s: float, left: _Remainder | None
+        self, state: Array, packed: Array, predicted_s: float, left: Remainder | None
     ) -> Start:
         """Start with the predicted terminal time: from a plan that is near, else cold."""
         packed = self._with_time(packed, predicted_s)
         reference = None
         if left is not None and left.helps(TerminalTime.PREDICTED):
-            reference = self._resample(left, state, self.scp, predicted_s)
+            reference = left.reference(state, self.transcription.layout, predicted_s)
         return Start(self.scp, packed, reference, TerminalTime.PREDICTED)
 
     def _starts(
-        self, state: Array, packed: Array, left: _Remainder | None, source: TerminalTime
+        self, state: Array, packed: Array, left: Remainder | None, source: TerminalTime
     ) -> Iterator[Start]:
         """What to start from with a fixed or free terminal time, the most promising first."""
         free = source is TerminalTime.FREE
         scp = self._free if free else self.scp
         if left is not None and left.helps(source):
             packed = self._with_time(packed, left.seconds)
-            reference = self._resample(left, state, scp, left.seconds)
+            reference = left.reference(state, scp.transcription.layout, left.seconds)
             yield Start(scp, packed, reference, source)
         yield Start(scp, packed, None, source)
         guess = self.problem.terminal_time_guess
@@ -382,14 +351,3 @@ class Planner:
         changed = packed.copy()
         changed[self._time] = seconds
         return changed
-
-    def _resample(self, left: _Remainder, state: Array, scp: Scp, seconds: float) -> Array:
-        """Reference vector from what is left of a plan, stretched to a terminal time."""
-        plan = left.plan
-        moments = np.linspace(left.elapsed_s, plan.terminal_time_s, self.settings.intervals + 1)
-        states, controls = (
-            np.column_stack([np.interp(moments, plan.times_s, column) for column in table.T])
-            for table in (plan.states, plan.controls)
-        )
-        states[0] = state
-        return scp.transcription.layout.reference(states, controls, seconds)

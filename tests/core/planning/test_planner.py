@@ -1,9 +1,11 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
+from core.toy_problems import cart
 from numpy.typing import NDArray
 from oracles.powered_descent_nlp import Status, solve_free_time, solve_least_time
 from oracles.powered_descent_physics import PAPER_INITIAL_STATE, PAPER_PARAMETERS, state_rate
@@ -346,3 +348,39 @@ def test_settings_that_suit_a_problem_are_its_own() -> None:
     assert entry.hold is ControlHold.LINEAR
     assert PlannerSettings.suited(problems.get("powered_descent")) == PlannerSettings()
     assert PlannerSettings.suited(problems.get("entry"), intervals=60).intervals == 60
+
+
+def test_a_problem_whose_initial_state_no_parameters_hold_plans_from_it_alone() -> None:
+    planner = Planner(cart())
+    assert planner.initial_state.tolist() == [0.0, 0.0]
+    assert planner.plan().converged
+    moved = planner.plan([0.1, 0.0])
+    assert moved.status is PlanStatus.INVALID_STATE
+    assert "initial_state_parameters" in moved.message
+
+
+def test_parameters_that_do_not_hold_the_initial_state_are_refused() -> None:
+    # Named, but the declaration's initial state is another.
+    problem = replace(
+        cart(), initial_state_parameters=("start",), initial_state=lambda p: 2.0 * p["start"]
+    )
+    outcome = Planner(problem, parameters={"start": (0.1, 0.0)}).plan()
+    assert outcome.status is PlanStatus.INVALID_STATE
+
+
+def test_only_problems_are_planned() -> None:
+    with pytest.raises(InvalidInputError, match=r"problems\.get"):
+        Planner("powered_descent")  # type: ignore[arg-type]
+
+
+def test_values_win_over_the_vehicle_and_both_over_the_settings() -> None:
+    vehicle = Path(__file__).parents[3] / "config" / "vehicles" / "mars_lander.yaml"
+    settings = PlannerSettings(parameters={"specific_impulse": 1.0, "thrust_prox": 3.0})
+    planner = Planner(
+        problems.get("powered_descent"), settings, vehicle=vehicle, parameters={"gravity": 3.5}
+    )
+    read = planner.problem.read_vehicle(vehicle)
+    values = planner.problem.table.unpack(planner.parameters)
+    assert values["specific_impulse"] == read["specific_impulse"]
+    assert values["gravity"] == 3.5 != read["gravity"]
+    assert values["thrust_prox"] == 3.0
