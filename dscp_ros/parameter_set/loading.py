@@ -118,7 +118,7 @@ def _load(snapshot: Path, directory: Path, choice: ProblemChoice | None) -> Para
     try:
         provenance = read_provenance(snapshot / PROVENANCE_FILE)
         digests = _check_files(snapshot, provenance)
-        values = read_values(snapshot / PARAMETERS_FILE, choice)
+        values = read_values(snapshot / PARAMETERS_FILE, provenance.get("problem"), choice)
         _check_agreement(snapshot, provenance, values)
         network = _network(snapshot, values) if NETWORK_FILE in digests else None
     except DscpError as error:
@@ -158,9 +158,10 @@ def _check_files(snapshot: Path, provenance: Mapping[str, Any]) -> dict[str, str
 
 def _check_agreement(snapshot: Path, provenance: Mapping[str, Any], values: CheckedValues) -> None:
     """Refuse parameters that are not those that the provenance tells of."""
-    for name, found in (("problem", values.problem.name), ("formulation", values.formulation)):
-        if provenance.get(name) != found:
-            raise InvalidInputError(name, found, f"{provenance.get(name)!r}, as in the provenance")
+    formulation = provenance.get("formulation")
+    if formulation != values.formulation:
+        bound = f"{formulation!r}, as in the provenance"
+        raise InvalidInputError("formulation", values.formulation, bound)
     vehicle = provenance.get("vehicle")
     if not isinstance(vehicle, dict):
         raise ParameterSetError(f"{snapshot / PROVENANCE_FILE}: vehicle {vehicle!r}, no mapping")

@@ -62,23 +62,29 @@ class CheckedValues:
         return self.problem.vehicle_of(self.parameters)
 
 
-def read_values(path: Path, choice: ProblemChoice | None = None) -> CheckedValues:
+def read_values(path: Path, problem: Any, choice: ProblemChoice | None = None) -> CheckedValues:
     """Values of the parameter file of a set.
 
     Args:
         path: The file.
+        problem: Name of the problem by the set's provenance.
         choice: The problem where the file names none, as that of a problem from a Python file.
 
     Raises:
-        InvalidInputError: The file is unreadable, a name, type or value is wrong, or it names a
-            Python file.
+        InvalidInputError: The file is unreadable, a name, type or value is wrong, it names a Python
+            file, or its problem is another one.
     """
     given = read_file(str(path), NODE)
-    named = given.get(PROBLEM.name)
-    if named is None:
-        return check_values(given, choice)
-    refuse_file(named)
-    return check_values(given)
+    bound = f"{problem!r}, as in the provenance"
+    if PROBLEM.name in given:
+        refuse_file(given[PROBLEM.name])
+        choice = ProblemChoice.read(_checked(PROBLEM, given))
+    else:
+        choice = choice or ProblemChoice.read(str(PROBLEM.default))
+        bound += "; the set names no problem, so name it where you use the set"
+    if choice.name != problem:
+        raise InvalidInputError(PROBLEM.name, choice.name, bound)
+    return check_values(given, choice)
 
 
 def refuse_file(problem: Any) -> None:

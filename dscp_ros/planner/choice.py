@@ -42,6 +42,15 @@ class ProblemChoice:
         """Whether it is one of a Python file."""
         return is_file(self.text)
 
+    @property
+    def name(self) -> str:
+        """Name of the problem.
+
+        Raises:
+            InvalidInputError: See `make`.
+        """
+        return self.make(next(iter(self.family.formulations), "")).name
+
     def make(self, formulation: str) -> OptimalControlProblem:
         """The declaration.
 

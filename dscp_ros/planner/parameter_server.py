@@ -93,10 +93,10 @@ class ParameterServer:
         # rclpy offers no public way to what the command line and files gave; it ignores names
         # that are not declared.
         given: Mapping[str, Any] = node._parameter_overrides
-        check_parameter_names(list(given), list(node.get_parameters_by_prefix("")))
         self._origin = self._read()
+        check_parameter_names(list(given), list(node.get_parameters_by_prefix("")))
         self._take_over(self._values())
-        self._check_sets(self._origin, self.settings)
+        self._origin.sources.check_vehicle(self._vehicle(self.settings))
         self._on_change: Callable[[], None] | None = None
         node.add_on_set_parameters_callback(self._validate)
         node.add_post_set_parameters_callback(self._apply)
@@ -126,7 +126,7 @@ class ParameterServer:
         read |= self._dropped(given, current)
         values = self._merged(read)
         settings = self._settings_of(values)
-        self._check_sets(origin, settings)
+        origin.sources.check_vehicle(self._vehicle(settings))
         return FileChange(
             setup=self._setup_of(settings, values, origin),
             values={n: v for n, v in read.items() if not self._table[n].read_only},
@@ -174,13 +174,11 @@ class ParameterServer:
             raise InvalidInputError(PROBLEM.name, text, f"{named!r}, as in the files by now")
         return ProblemChoice.read(text)
 
-    def _check_sets(self, origin: _Origin, settings: NodeSettings) -> None:
-        origin.sources.check_vehicle(self.problem.name, self._vehicle(settings))
-
     def _read(self) -> _Origin:
         """Read the files; that of the problem is not run again."""
         node_name = self._node.get_fully_qualified_name()
         sources = read_sources(self._arguments, node_name, self._choice)
+        sources.check_problem(self.problem.name)
         return _Origin(sources, Predictors(self.problem.extras.network, sources.network))
 
     def _declare(self, parameter: NodeParameter) -> Any:

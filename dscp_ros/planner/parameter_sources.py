@@ -34,22 +34,28 @@ class ParameterSources:
     sets: tuple[ParameterSet, ...]
     network: NamedNetwork | None
 
-    def check_vehicle(self, problem: str, vehicle: Mapping[str, Any]) -> None:
-        """Refuse a problem or vehicle that a set was not made for.
+    def check_problem(self, problem: str) -> None:
+        """Refuse a problem that a set was not made for.
+
+        Raises:
+            ParameterSetError: A set is of another problem.
+        """
+        for one in self.sets:
+            if one.problem != problem:
+                raise ParameterSetError(
+                    f"{one.directory}: for the problem {one.problem}, not for {problem}"
+                )
+
+    def check_vehicle(self, vehicle: Mapping[str, Any]) -> None:
+        """Refuse a vehicle that a set was not made for.
 
         Args:
-            problem: Name of the problem.
             vehicle: What `OptimalControlProblem.vehicle_of` gives.
 
         Raises:
-            ParameterSetError: A set is of another problem or vehicle.
+            ParameterSetError: A set is of another vehicle.
         """
         for parameter_set in self.sets:
-            if parameter_set.problem != problem:
-                raise ParameterSetError(
-                    f"{parameter_set.directory}: of the problem {parameter_set.problem}, not of "
-                    f"{problem}"
-                )
             parameter_set.check_vehicle(vehicle)
 
     def label(self, values: Mapping[str, Any], vehicle: Mapping[str, Any]) -> str:

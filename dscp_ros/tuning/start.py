@@ -91,9 +91,10 @@ def read_start(
         raise InvalidInputError("--problem", problem, f"{named}, as in the files")
     choice = ProblemChoice.read(problem or named or str(PROBLEM.default))
     sources = read_sources(arguments, node, choice)
+    sources.check_problem(choice.name)
     given = dict(sources.values)
     values = check_values(given, choice)
-    sources.check_vehicle(values.problem.name, values.vehicle)
+    sources.check_vehicle(values.vehicle)
     notes: tuple[str, ...] = ()
     source = values.planner.terminal_time
     if (network or tunes_network) and source is not TerminalTime.PREDICTED:
