@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 BENCHMARKS = {
+    "start": "CPU time of imports, commands and the first plan in a fresh interpreter",
     "sweep": "gradients against central differences, iterations and optimum of the paper's case",
     "random_states": "how many random states of the paper's box get a certified plan, and how fast",
     "phases": "where the time of a forward run goes, and what a backward run costs beside it",

@@ -11,7 +11,7 @@ Example:
     'certified, converged: terminal time 33 s (fixed), cost -31759.09 kg'
     >>> gradient = planner.gradient("cost", at=outcome)
     >>> round(gradient["specific_impulse"], 2), gradient.trusted
-    (-19.73, True)
+    (-19.78, True)
 """
 
 from __future__ import annotations

@@ -6,7 +6,16 @@ from typing import Any
 
 
 class DscpError(Exception):
-    """Base class of every error that this project raises on purpose."""
+    """Base class of every error that this project raises on purpose.
+
+    Example:
+        >>> from dscp_core import DscpError, problems
+        >>> try:
+        ...     problems.get("ascent")
+        ... except DscpError as error:
+        ...     print(type(error).__name__)
+        InvalidInputError
+    """
 
 
 class InvalidInputError(DscpError, ValueError):
@@ -16,6 +25,11 @@ class InvalidInputError(DscpError, ValueError):
         field: Name of the offending field or parameter.
         value: The value that was given.
         bound: What was expected, in words or as an interval.
+
+    Example:
+        >>> from dscp_core import InvalidInputError
+        >>> str(InvalidInputError("mass", -1.0, "> 0 kg"))
+        'mass: got -1.0, expected > 0 kg'
     """
 
     def __init__(self, field: str, value: Any, bound: str) -> None:

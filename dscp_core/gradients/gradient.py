@@ -21,7 +21,15 @@ INITIAL_STATE = "initial_state"
 
 
 class Method(Enum):
-    """How a gradient was computed."""
+    """How a gradient was computed.
+
+    Example:
+        >>> from dscp_core import Method, Planner, problems
+        >>> planner = Planner(problems.get("powered_descent"))
+        >>> gradient = planner.gradient("cost", method=Method.UNROLLED)
+        >>> gradient.method.value, gradient.iterations
+        ('unrolled', 7)
+    """
 
     UNROLLED = "unrolled"
     IMPLICIT = "implicit"
@@ -72,6 +80,15 @@ class Gradient:
         free_terminal_time: Whether that is a decision; the gradient with respect to the parameter
             ``terminal_time`` is then that of a first guess.
         problem: The declaration.
+
+    Example:
+        >>> from dscp_core import Planner, problems
+        >>> planner = Planner(problems.get("powered_descent"))
+        >>> gradient = planner.gradient("mass")
+        >>> gradient["initial_velocity"].shape, gradient.trusted
+        ((3,), True)
+        >>> round(gradient["specific_impulse"], 2)  # kg per s
+        19.72
     """
 
     value: float

@@ -57,6 +57,13 @@ class FinalStateLoss:
     Attributes:
         state: Name of the state.
         factor: Sign or weight.
+
+    Example:
+        >>> from dscp_core import FinalStateLoss, Planner, problems
+        >>> planner = Planner(problems.get("powered_descent"))
+        >>> fuel = planner.gradient(FinalStateLoss("mass", -1.0))
+        >>> fuel["specific_impulse"] < 0.0  # a better engine burns less
+        True
     """
 
     state: str
@@ -84,7 +91,14 @@ class FinalStateLoss:
 
 @dataclass(frozen=True)
 class CostLoss:
-    """True cost J of the final trajectory (eq. 1, discretised), in its own units."""
+    """True cost J of the final trajectory (eq. 1, discretised), in its own units.
+
+    Example:
+        >>> from dscp_core import CostLoss, Planner, problems
+        >>> planner = Planner(problems.get("powered_descent"))
+        >>> planner.gradient(CostLoss()).of.name
+        'cost'
+    """
 
     def value(self, transcription: Transcription, trace: ScpResult) -> float:
         """See `Loss.value`."""
@@ -101,7 +115,14 @@ class CostLoss:
 
 @dataclass(frozen=True)
 class ConvergenceLoss:
-    """Sum over iterations k >= 2 of |J_k - J_K|, the convergence metric of section 4.2.1."""
+    """Sum over iterations k >= 2 of |J_k - J_K|, the convergence metric of section 4.2.1.
+
+    Example:
+        >>> from dscp_core import ConvergenceLoss, Planner, problems
+        >>> planner = Planner(problems.get("powered_descent"))
+        >>> planner.gradient(ConvergenceLoss()).of.symbol
+        'sum |J_k - J_K|'
+    """
 
     def value(self, transcription: Transcription, trace: ScpResult) -> float:
         """See `Loss.value`."""
@@ -152,3 +173,24 @@ class LogConvergenceLoss:
         metric = ConvergenceLoss().gradient(transcription, trace)
         factor = 1.0 / (self.scale * self._argument(transcription, trace))
         return LossGradient(factor * metric.decisions, factor * metric.parameters)
+
+
+@dataclass(frozen=True, eq=False)
+class SeedLoss:
+    """Linear functional ``seed . final_reference``, whose gradient is any wanted cotangent.
+
+    Attributes:
+        seed: (R,) weight of every entry of the scaled reference vector after the last iteration.
+    """
+
+    seed: Array
+
+    def value(self, transcription: Transcription, trace: ScpResult) -> float:
+        """See `Loss.value`."""
+        return float(self.seed @ trace.final_reference)
+
+    def gradient(self, transcription: Transcription, trace: ScpResult) -> LossGradient:
+        """See `Loss.gradient`."""
+        decisions = np.zeros((len(trace.iterations), transcription.layout.size))
+        decisions[-1, : self.seed.size] = self.seed
+        return LossGradient(decisions, np.zeros(transcription.table.size))

@@ -29,6 +29,17 @@ class PlanLayer(LossLayer):
     Attributes:
         samples: What became of every sample of the last call; its backward pass completes them
             with the verdict on their gradients.
+
+    Example:
+        >>> import torch
+        >>> from dscp_core import Planner, problems
+        >>> planner = Planner(problems.get("powered_descent"))
+        >>> layer = planner.layer("mass", inputs=("terminal_time",))
+        >>> time = torch.tensor([33.0, 25.0], requires_grad=True)
+        >>> loss = layer(terminal_time=time)
+        >>> loss.nansum().backward()
+        >>> [sample.status.name for sample in layer.samples], torch.isnan(loss).tolist()
+        (['CONVERGED', 'INFEASIBLE'], [False, True])
     """
 
     def __init__(

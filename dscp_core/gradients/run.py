@@ -43,7 +43,18 @@ _MOST_SETTLING_ITERATIONS = 60
 
 
 class DifferentiationError(DscpError):
-    """A trace that cannot be differentiated."""
+    """A trace that cannot be differentiated.
+
+    Example:
+        >>> from dscp_core import DifferentiationError, Planner, problems
+        >>> planner = Planner(problems.get("powered_descent"))
+        >>> below_ground = planner.plan([-100.0, 0.0, 0.0, 0.0, 0.0, 0.0, 3e4])
+        >>> try:
+        ...     planner.gradient("cost", at=below_ground)
+        ... except DifferentiationError as error:
+        ...     print(str(error)[:33])
+        there is no plan to differentiate
+    """
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from torch.autograd.function import once_differentiable
 
 from dscp_core.errors import InvalidInputError
 from dscp_core.gradients.gradient import Gradient, Method, parts, positions
-from dscp_core.gradients.losses import Loss, LossGradient
+from dscp_core.gradients.losses import Loss, SeedLoss
 from dscp_core.gradients.run import DifferentiationError, implicit, unrolled
 from dscp_core.problem.declaration import TERMINAL_TIME
 from dscp_core.problem.parameters import Value
@@ -32,27 +32,6 @@ _WITHOUT_GRADIENT = (
     ScpStatus.SUBPROBLEM_INFEASIBLE,
     ScpStatus.SOLVER_FAILURE,
 )
-
-
-@dataclass(frozen=True, eq=False)
-class SeedLoss:
-    """Linear functional ``seed . final_reference``, whose gradient is any wanted cotangent.
-
-    Attributes:
-        seed: (R,) weight of every entry of the scaled reference vector after the last iteration.
-    """
-
-    seed: Array
-
-    def value(self, transcription: Transcription, trace: ScpResult) -> float:
-        """See `Loss.value`."""
-        return float(self.seed @ trace.final_reference)
-
-    def gradient(self, transcription: Transcription, trace: ScpResult) -> LossGradient:
-        """See `Loss.gradient`."""
-        decisions = np.zeros((len(trace.iterations), transcription.layout.size))
-        decisions[-1, : self.seed.size] = self.seed
-        return LossGradient(decisions, np.zeros(transcription.table.size))
 
 
 @dataclass
@@ -289,7 +268,17 @@ class LossLayer(DscpLayer):
 
 
 class DscpLossLayer(LossLayer):
-    """Loss of an SCP run as a function of named parameters."""
+    """Loss of an SCP run as a function of named parameters.
+
+    Example:
+        >>> from dscp_core import CostLoss, DscpLossLayer, Planner, problems
+        >>> planner = Planner(problems.get("powered_descent"))
+        >>> layer = DscpLossLayer(planner.scp, ("terminal_time",), CostLoss())
+        >>> import torch
+        >>> batch = layer(terminal_time=torch.tensor([33.0]))
+        >>> batch.values.shape, batch.samples[0].usable
+        (torch.Size([1]), True)
+    """
 
     def __init__(
         self,
@@ -334,7 +323,16 @@ class DscpLossLayer(LossLayer):
 
 
 class DscpTrajectoryLayer(DscpLayer):
-    """Final trajectory of an SCP run as a function of named parameters."""
+    """Final trajectory of an SCP run as a function of named parameters.
+
+    Example:
+        >>> from dscp_core import DscpTrajectoryLayer, Planner, problems
+        >>> planner = Planner(problems.get("powered_descent"))
+        >>> layer = DscpTrajectoryLayer(planner.scp, ("terminal_time",))
+        >>> import torch
+        >>> layer(terminal_time=torch.tensor([33.0, 34.0])).states.shape
+        torch.Size([2, 51, 7])
+    """
 
     def __init__(
         self,

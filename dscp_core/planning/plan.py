@@ -17,7 +17,13 @@ Array = NDArray[np.float64]
 
 
 class PlanStatus(IntEnum):
-    """Outcome of an attempt; the numbers are stable and appear in reports and logs."""
+    """Outcome of an attempt; the numbers are stable and appear in reports and logs.
+
+    Example:
+        >>> from dscp_core import PlanStatus
+        >>> PlanStatus(0).name
+        'CERTIFIED'
+    """
 
     CERTIFIED = 0
     NOT_CERTIFIED = 1
@@ -33,6 +39,12 @@ class TerminalTime(Enum):
 
     FIXED: the parameter ``terminal_time``, and after the first plan what is left of it. FREE: a
     decision of the subproblems. PREDICTED: a predictor's, where it knows the state, else FREE.
+
+    Example:
+        >>> from dscp_core import Planner, PlannerSettings, TerminalTime, problems
+        >>> free = PlannerSettings(terminal_time=TerminalTime.FREE)
+        >>> round(Planner(problems.get("powered_descent"), free).plan().terminal_time_used_s, 1)
+        32.8
     """
 
     FIXED = "fixed"
@@ -54,6 +66,13 @@ class Plan:
         controls: (N+1, nu).
         state_rates: (N+1, nx) time derivative of the states under the nodal controls.
         terminal_time_s: Flight time.
+
+    Example:
+        >>> from dscp_core import Planner, problems
+        >>> planner = Planner(problems.get("powered_descent"))
+        >>> plan = planner.plan().plan
+        >>> plan.states.shape, plan.controls.shape, plan.control_names
+        ((51, 7), (51, 3), ('thrust_x', 'thrust_y', 'thrust_z'))
     """
 
     problem: str
@@ -93,6 +112,15 @@ class PlanOutcome:
         warm_started: Whether the result came from the last plan.
         solver: Backend that answered last.
         parameters: What was planned with, by name, SI: initial state and terminal time included.
+
+    Example:
+        >>> from dscp_core import Planner, problems
+        >>> planner = Planner(problems.get("powered_descent"))
+        >>> outcome = planner.plan()
+        >>> outcome.certified, outcome.converged, outcome.cost_unit
+        (True, True, 'kg')
+        >>> outcome.certificate.value("miss_position") < 1.0
+        True
     """
 
     status: PlanStatus

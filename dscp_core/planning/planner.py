@@ -45,6 +45,16 @@ class Planner:
     """Makes plans for one problem; keeps all symbolic work between plans.
 
     Not safe for plans from several threads at once.
+
+    Example:
+        >>> from dscp_core import Planner, problems
+        >>> planner = Planner(problems.get("powered_descent"))
+        >>> planner.plan().headline
+        'certified, converged: terminal time 32.81 s (fixed), cost -31760.3 kg'
+        >>> planner.state_names
+        ('x', 'y', 'z', 'vx', 'vy', 'vz', 'mass')
+        >>> planner.plan([4000.0, 400.0, 400.0, -90.0, 30.0, -30.0, 38000.0]).certified
+        True
     """
 
     def __init__(

@@ -40,6 +40,12 @@ class PlannerSettings:
         terminal_time: Where the terminal time comes from.
         hold: How the certificate flies the controls between the nodes.
         options: How to iterate; its deadline is set for every plan.
+
+    Example:
+        >>> from dscp_core import PlannerSettings, problems
+        >>> settings = PlannerSettings.suited(problems.get("entry"), intervals=60)
+        >>> settings.intervals, settings.terminal_time.value
+        (60, 'free')
     """
 
     parameters: Mapping[str, Value] = field(default_factory=dict)

@@ -1,4 +1,14 @@
-"""Problems by name. This is the only place that knows the names of the shipped ones."""
+"""Problems by name. This is the only place that knows the names of the shipped ones.
+
+Example:
+    >>> from dscp_core import problems
+    >>> problems.names()[:2]
+    ('powered_descent', 'entry')
+    >>> problems.get("entry").default_intervals
+    100
+    >>> problems.get("entry", "printed").formulation  # or problems.get("FILE.py:NAME")
+    'printed'
+"""
 
 from __future__ import annotations
 

@@ -35,6 +35,12 @@ class ProblemFamily:
     Attributes:
         formulations: Their names, the default first.
         make: Declares the problem in one of them.
+
+    Example:
+        >>> from dscp_core import ProblemFamily, problems
+        >>> family = ProblemFamily(("quadratic", "printed"), lambda f: problems.get("entry", f))
+        >>> family.make("printed").formulation
+        'printed'
     """
 
     formulations: tuple[str, ...]

@@ -53,6 +53,12 @@ class ScpOptions:
         deadline_s: Wall time for all iterations, or None.
         solver: Backend, or backends to try in order, separated by commas.
         solver_settings: Accuracy and limits of the backend.
+
+    Example:
+        >>> from dscp_core import Planner, PlannerSettings, ScpOptions, problems
+        >>> settings = PlannerSettings(options=ScpOptions(max_iterations=5, solver="clarabel"))
+        >>> Planner(problems.get("powered_descent"), settings).plan().iterations
+        5
     """
 
     max_iterations: int = 20
