@@ -25,14 +25,13 @@ NODE_NAME = "planner"
 DESCRIPTION = """\
 Run the planner as a ROS 2 node (default name: /planner).
 
-in   ~/state          nav_msgs/Odometry            position, velocity (twist in the child frame)
-     ~/mass           geometry_msgs/InertiaStamped mass that completes ~/state
-     ~/vehicle_state  sensor_msgs/JointState       or: x y z vx vy vz mass in one message
-                      (entry: this only, with r longitude latitude speed flight_path_angle heading
-                      angle_of_attack bank_angle)
+in   ~/vehicle_state  sensor_msgs/JointState       every state as a named scalar
+     ~/state          nav_msgs/Odometry            or, of landings and their like: position,
+                                                   velocity (twist in the child frame), and
+     ~/mass           geometry_msgs/InertiaStamped the mass that completes them
 out  ~/trajectory     trajectory_msgs/JointTrajectory   certified plans only
-     ~/path           nav_msgs/Path
-     ~/markers        visualization_msgs/MarkerArray
+     ~/path           nav_msgs/Path                     of problems that bring drawings
+     ~/markers        visualization_msgs/MarkerArray    likewise
      ~/report         diagnostic_msgs/DiagnosticArray   one per attempt or refused input
      /diagnostics     diagnostic_msgs/DiagnosticArray   health, once a second
 srv  ~/plan, ~/reset, ~/reload                     std_srvs/Trigger
@@ -43,6 +42,7 @@ examples:
   dscp planner
   dscp planner --params-file config/powered_descent.yaml
   dscp planner --params-file config/entry.yaml
+  dscp planner --problem my_problem.py:NAME
   dscp planner --ros-args -p deadline_s:=0.1 -r '~/state:=/vehicle/odometry'
 
 exit codes: 0 ended by SIGINT or SIGTERM, 2 bad arguments or parameters.
@@ -65,6 +65,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="ROS parameter file (YAML); may be given several times, later ones win",
     )
     parser.add_argument(
+        "--problem",
+        metavar="PROBLEM",
+        help="a known name, or FILE.py:NAME for a problem in a Python file, which is run; the same "
+        "as -p problem:=PROBLEM",
+    )
+    parser.add_argument(
         "--ros-args",
         nargs=argparse.REMAINDER,
         default=[],
@@ -76,6 +82,9 @@ def ros_arguments(args: argparse.Namespace) -> list[str]:
     """ROS command line of parsed arguments."""
     files = [word for path in args.params_file for word in ("--params-file", path)]
     words = [*files, *args.ros_args]
+    if args.problem is not None:
+        quoted = args.problem.replace("'", "''")  # rcl reads YAML
+        words += ["-p", f"problem:='{quoted}'"]
     return ["--ros-args", *words] if words else []
 
 

@@ -33,6 +33,7 @@ from msg_adapters.report_message import report_from_message
 from msg_adapters.state import StampedState
 
 STRANGER = Path(__file__).with_name("stranger.py")
+STRANGER_IN_SPACE = Path(__file__).with_name("stranger_in_space.py")
 STATE = np.array([0.5, 1.0, 0.2, -0.3])
 TOPIC = "/planner/vehicle_state"
 START_NS = 1_700_000_000_000_000_000
@@ -104,10 +105,10 @@ class AnyClient:
 
 @contextmanager
 def running(
-    ros: Harness, problem: OptimalControlProblem, *arguments: str
+    ros: Harness, problem: OptimalControlProblem, *arguments: str, before: Sequence[str] = ()
 ) -> Iterator[tuple[AnyClient, subprocess.Popen[str]]]:
     """A connected client and the node's process with ROS arguments, ended at the end."""
-    process = start(ros, ["--ros-args", *PATIENT, *arguments])
+    process = start(ros, [*before, "--ros-args", *PATIENT, *arguments])
     try:
         client = AnyClient(ros, problem)
         client.connect(process)

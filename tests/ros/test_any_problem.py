@@ -2,20 +2,31 @@
 
 from __future__ import annotations
 
+import shutil
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
+from nav_msgs.msg import Odometry
+from nav_msgs.msg import Path as PathMessage
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
-from ros.any_problem_support import PLAN_TIMEOUT_S, STATE, STRANGER, running, stranger, write_log
-from ros.planner_support import ROOT, START_TIMEOUT_S
+from ros.any_problem_support import (
+    PLAN_TIMEOUT_S,
+    STATE,
+    STRANGER_IN_SPACE,
+    running,
+    stranger,
+    write_log,
+)
+from ros.planner_support import LATCHED, START_TIMEOUT_S
+from visualization_msgs.msg import MarkerArray
 
 from dscp_core import problems
-from dscp_core.errors import InvalidInputError
 from dscp_core.planning.plan import PlanStatus
 from dscp_core.planning.planner import Planner
 from dscp_core.tuning import tuner
@@ -27,6 +38,9 @@ from dscp_ros.planner.choice import ProblemChoice
 from dscp_ros.planner.parameters import node_settings, parameter_table
 from dscp_ros.tuning.start import read_start
 from msg_adapters.errors import InputCode
+from msg_adapters.odometry import odometry_from_kinematics
+from msg_adapters.report import PlanReport
+from msg_adapters.state import Kinematics
 from msg_adapters.trajectory import plan_from_trajectory
 
 DISTRIBUTION = {
@@ -317,8 +331,60 @@ def test_fuel_is_no_loss_of_a_problem_without_a_mass(puck, tmp_path, capsys):
     assert "one of vehicle_state, report" in capsys.readouterr().err
 
 
-def test_the_command_line_takes_the_problem_by_name(ros, tmp_path):
-    with pytest.raises(InvalidInputError, match="one of powered_descent"):
-        ProblemChoice.read("nothing")
-    assert STRANGER.exists()
-    assert ROOT.exists()
+def test_the_command_line_names_the_problem_and_its_path_may_be_odd(ros, tmp_path):
+    folder = tmp_path / "it's #1: here"
+    folder.mkdir()
+    puck = stranger(folder)
+    with running(ros, problems.get(puck), before=("--problem", puck)) as (client, _):
+        assert client.report().code == PlanStatus.CERTIFIED
+
+
+def test_a_problem_may_bring_odometry_settings_and_a_scene(ros, tmp_path):
+    text = f"{shutil.copy(STRANGER_IN_SPACE, tmp_path / 'drone.py')}:drone"
+    problem = problems.get(text)
+    state = np.array([40.0, 1.0, -2.0, -3.0, 0.5, 0.0])
+    with running(ros, problem, "-p", f"problem:={text}", "-p", "site_frame:=pad") as (client, _):
+        node = client.node
+        paths: list[Path] = []
+        drawings: list[MarkerArray] = []
+        node.create_subscription(PathMessage, "/planner/path", paths.append, LATCHED)
+        node.create_subscription(MarkerArray, "/planner/markers", drawings.append, LATCHED)
+        publisher = node.create_publisher(Odometry, "/planner/state", 10)
+        assert ros.wait_for(lambda: publisher.get_subscription_count() > 0)
+        assert node.count_subscribers("/planner/mass") == 0
+
+        def send(height_m: float) -> PlanReport:
+            stamp_ns = time.time_ns()
+            kinematics = Kinematics(stamp_ns, np.array([1.0, -2.0, height_m]), state[[4, 5, 3]])
+            publisher.publish(odometry_from_kinematics(kinematics, frame="pad"))
+            return client.report_of(stamp_ns)
+
+        report = send(40.0)
+        assert report.code == PlanStatus.CERTIFIED, report.message
+        assert report.mass_source is None
+        assert (report.state["x"], report.state["z"], report.state["vz"]) == (1.0, 40.0, -3.0)
+        assert report.certificate.values.keys() == {"miss_place_m"}
+        plan, _ = plan_from_trajectory(client.trajectories[-1], client.layout, frame="pad")
+        np.testing.assert_allclose(plan.states[0], state, rtol=0.0, atol=1e-9)
+        # Efforts stand at the velocities that they act on.
+        effort = np.array(client.trajectories[-1].points[0].effort)
+        np.testing.assert_array_equal(effort[[5, 3, 4]], plan.controls[0])
+        assert ros.wait_for(lambda: bool(paths and drawings))
+        first = paths[-1].poses[0].pose.position
+        assert (first.x, first.y, first.z) == pytest.approx((1.0, -2.0, 40.0))
+        by_name = {marker.ns: marker for marker in drawings[-1].markers}
+        assert by_name.keys() == {"path", "push", "ground", "site"}
+        assert by_name["site"].scale.x == 2.0 * 3.0
+
+        below = send(-1.0)
+        assert below.code == InputCode.BELOW_GROUND
+        assert below.rejection.field == "pose.pose.position.z"
+        far = send(2000.0)
+        assert far.code == InputCode.OUT_OF_RANGE
+
+        # A scene that fails costs the picture only.
+        (result,) = set_parameters(ros, client, Parameter("site_radius_m", value=0.0))
+        assert result.successful
+        report = send(39.0)
+        assert report.published
+        assert report.code == PlanStatus.CERTIFIED
