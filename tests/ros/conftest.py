@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 # Child processes inherit both: the first name is for Fast DDS 2 (Jazzy), the second for 3.
-_PROFILES = str(Path(__file__).with_name("fastdds_profiles.xml"))
+_REPOSITORY = Path(__file__).resolve().parents[2]
+_PROFILES = str(_REPOSITORY / "config" / "fastdds_profiles.xml")
 os.environ["FASTRTPS_DEFAULT_PROFILES_FILE"] = _PROFILES
 os.environ["FASTDDS_DEFAULT_PROFILES_FILE"] = _PROFILES
 
@@ -25,7 +26,6 @@ WAIT_TIMEOUT_S = 10.0
 """How long `wait_for` waits unless told: far above the 0.5 s that discovery may take."""
 
 _POLL_INTERVAL_S = 0.005
-_REPOSITORY = Path(__file__).resolve().parents[2]
 
 
 def wait_for(predicate: Callable[[], bool], timeout: float = WAIT_TIMEOUT_S) -> bool:

@@ -262,6 +262,7 @@ def refused(ros, folder: Path, *arguments: str) -> str:
         ("hocky", ("hocky", "one of powered_descent, entry", "FILE.py:NAME")),
         ("stateless.py:problem", ("states",)),
         ("fixed.py:problem", ("initial_state_parameters of puck", "4 states")),
+        ("raising.py:problem", ("puck", "wind")),
     ],
 )
 def test_what_is_no_problem_is_refused_at_the_start(ros, tmp_path, text, words):
@@ -274,6 +275,8 @@ def test_what_is_no_problem_is_refused_at_the_start(ros, tmp_path, text, words):
     (tmp_path / "stateless.py").write_text(sys_path + changed.format("states=()"))
     without = changed.format("initial_state_parameters=()")
     (tmp_path / "fixed.py").write_text(sys_path + without)
+    raising = changed.format("dynamics=lambda x, u, p: p['wind']")
+    (tmp_path / "raising.py").write_text(sys_path + raising)
     line = refused(ros, tmp_path, "--ros-args", "-p", f"problem:={text}")
     for word in words:
         assert word in line
