@@ -6,7 +6,7 @@ one, ``provenance.json`` says where they come from and holds the checksums of al
 
 from dscp_ros.parameter_set.errors import ParameterSetError
 from dscp_ros.parameter_set.format import NETWORK_FILE, PARAMETERS_FILE, PROVENANCE_FILE
-from dscp_ros.parameter_set.loading import ParameterSet, directory_of, load
+from dscp_ros.parameter_set.loading import ParameterSet, directory_of, lies_in_set, load
 from dscp_ros.parameter_set.saving import check_target, save
 
 __all__ = [
@@ -17,6 +17,7 @@ __all__ = [
     "ParameterSetError",
     "check_target",
     "directory_of",
+    "lies_in_set",
     "load",
     "save",
 ]

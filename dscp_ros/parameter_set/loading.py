@@ -78,6 +78,12 @@ def directory_of(parameter_file: str | Path) -> Path | None:
     return None
 
 
+def lies_in_set(file: str | Path) -> bool:
+    """Whether a file, of any name and behind any link, has the provenance of a set beside it."""
+    places = (Path(file), Path(file).resolve())
+    return any(os.path.lexists(place.parent / PROVENANCE_FILE) for place in places)
+
+
 def load(directory: str | Path, choice: ProblemChoice | None = None) -> ParameterSet:
     """Read a set, as it is at one moment, even if another one takes its place meanwhile.
 

@@ -8,7 +8,13 @@ from pathlib import Path
 from typing import Any
 
 from dscp_core.errors import InvalidInputError
-from dscp_ros.parameter_set import ParameterSet, ParameterSetError, directory_of, load
+from dscp_ros.parameter_set import (
+    ParameterSet,
+    ParameterSetError,
+    directory_of,
+    lies_in_set,
+    load,
+)
 from dscp_ros.parameter_set.values import refuse_file
 from dscp_ros.planner.choice import ProblemChoice
 from dscp_ros.planner.declaration import VEHICLE_PREFIX
@@ -88,12 +94,11 @@ def named_problem(arguments: ParameterArguments, node_name: str) -> str | None:
     named = None
     for path in arguments.files:
         found = read_file(path, node_name).get(PROBLEM.name)
-        folder = directory_of(path)
-        if folder is not None and found is not None:
+        if found is not None and lies_in_set(path):
             try:
                 refuse_file(found)
             except InvalidInputError as error:
-                raise ParameterSetError(f"{folder}: {error}") from None
+                raise ParameterSetError(f"{path}: {error}") from None
         named = named if found is None else str(found)
     return named
 
