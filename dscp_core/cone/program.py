@@ -283,11 +283,11 @@ class ConeProgram:
     def from_matrices(
         Q: Matrix,
         c: ArrayLike,
-        A: Matrix,
-        b: ArrayLike,
-        G: Matrix,
-        h: ArrayLike,
-        n_nonnegative: int,
+        A: Matrix = None,
+        b: ArrayLike | None = None,
+        G: Matrix = None,
+        h: ArrayLike | None = None,
+        n_nonnegative: int | None = None,
         soc_dims: Sequence[int] = (),
     ) -> ConeProgram:
         """Build pattern and values from dense or scipy sparse matrices.
@@ -296,10 +296,10 @@ class ConeProgram:
             Q: (n, n) symmetric positive semidefinite, full (both triangles), or None for zero.
             c: (n,) linear cost.
             A: (p, n) equality matrix, or None for no equalities.
-            b: (p,) equality right-hand side.
+            b: (p,) equality right-hand side, or None.
             G: (m, n) cone matrix, or None for no cones.
-            h: (m,) cone right-hand side.
-            n_nonnegative: Number of leading rows of G with s >= 0.
+            h: (m,) cone right-hand side, or None.
+            n_nonnegative: Number of leading rows of G with s >= 0; None for all but the cones'.
             soc_dims: Dimension of each second-order cone.
 
         Stored zeros of sparse input stay part of the pattern; zeros of dense input do not.
@@ -308,6 +308,7 @@ class ConeProgram:
             InvalidInputError: Shapes, non-finite numbers, asymmetric or indefinite structure
                 of Q, cone sizes.
         """
+        b, h = ([] if right is None else right for right in (b, h))
         cost = np.array(c, dtype=np.float64, ndmin=1)
         if cost.ndim != 1:
             raise InvalidInputError("c.shape", cost.shape, "one dimension")
@@ -328,7 +329,7 @@ class ConeProgram:
             CscPattern.from_matrix(q),
             CscPattern.from_matrix(a),
             CscPattern.from_matrix(g),
-            n_nonnegative,
+            g.shape[0] - sum(soc_dims) if n_nonnegative is None else n_nonnegative,
             tuple(soc_dims),
         )
         values = ConeValues(

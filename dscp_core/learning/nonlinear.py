@@ -77,7 +77,7 @@ class NonlinearProgram:
             last = len(places) - int(constraint.skip_last)
             for place in places[int(constraint.skip_first) : last]:
                 inequalities += _inequalities(constraint, place, p)
-        cost = problem.terminal_cost(points[-1].x, z[0] * layout.time_scale, p)
+        cost = self._transcription.cost_function(z, packed)
         equal, unequal = ca.vertcat(*equalities), ca.vertcat(*inequalities)
         self._bounds = {
             "lbg": np.concatenate([np.zeros(equal.numel()), np.full(unequal.numel(), -np.inf)]),

@@ -8,7 +8,7 @@ what is certified, and by the constraints between the nodes.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from enum import Enum
 
@@ -26,6 +26,7 @@ from dscp_core.problem.declaration import (
     Where,
     named,
 )
+from dscp_core.problem.tracing import Tracer
 from dscp_core.transcription.compiled import CompiledFunction
 from dscp_core.transcription.stages import constraints
 
@@ -145,16 +146,19 @@ class PlanVerifier:
         x, u = ca.SX.sym("x", nx), ca.SX.sym("u", nu)
         packed = ca.SX.sym("p", problem.table.size)
         parameters = named(problem, packed)
+        trace = Tracer(problem.table, x, u, packed)
         self._scale = np.array([s.scale for s in problem.states])
         # Scaled, so that one tolerance suits every state.
-        scaled_rates = problem.dynamics(x * ca.DM(self._scale), u, parameters) / ca.DM(self._scale)
+        state = x * ca.DM(self._scale)
+        rates = trace("dynamics", problem.dynamics, state, u, parameters, rows=nx)
+        scaled_rates = rates / ca.DM(self._scale)
         self._rates = CompiledFunction("rates", [x, u, packed], [scaled_rates])
         self._checked = tuple(constraints(problem, Where.NODE))
         point = StagePoint(x, u, ca.SX(0.0))
         limits = ca.Function(
             "limits",
             [x, u, packed],
-            [ca.vertcat(*(_violation(c, point, parameters) for c in self._checked), ca.SX(0, 1))],
+            [_stack(_violation(c, trace, point, parameters) for c in self._checked)],
         )
         self._points = intervals * substeps + 1
         grid = [ca.MX.sym("x", nx, self._points), ca.MX.sym("u", nu, self._points)]
@@ -164,7 +168,7 @@ class PlanVerifier:
         self._misses = CompiledFunction(
             "misses",
             [x, packed],
-            [ca.vertcat(*(m.expression(x, parameters) for m in problem.misses), ca.SX(0, 1))],
+            [_stack(trace(f"miss {m.name}", m.expression, x, parameters) for m in problem.misses)],
         )
 
     def rates(self, states: Array, controls: Array, parameters: Array) -> Array:
@@ -198,6 +202,8 @@ class PlanVerifier:
         named_values = self._problem.table.unpack(parameters)
         for column, constraint in enumerate(self._checked):
             worst = int(np.argmax(values[:, column]))
+            if np.isneginf(values[worst, column]):
+                continue  # its bound is infinite: it is not imposed
             checks.append(
                 _check(
                     constraint.name,
@@ -283,9 +289,18 @@ def _stacked(
     return times, states, np.vstack(applied)[: times.size]
 
 
-def _violation(constraint: Constraint, point: StagePoint, parameters: dict[str, ca.SX]) -> ca.SX:
-    value = constraint.expression(point, parameters)
-    if isinstance(constraint, PathConstraint):
+def _stack(scalars: Iterable[ca.SX]) -> ca.SX:
+    return ca.vertcat(*scalars, ca.SX(0, 1))
+
+
+def _violation(
+    constraint: Constraint, trace: Tracer, point: StagePoint, parameters: dict[str, ca.SX]
+) -> ca.SX:
+    linear = isinstance(constraint, PathConstraint)
+    what = f"constraint {constraint.name}"
+    rows = 1 if linear else None
+    value = trace(what, constraint.expression, point, parameters, rows=rows)
+    if linear:
         return value
     return ca.norm_2(value[1:]) - value[0]
 

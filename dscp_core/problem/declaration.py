@@ -2,158 +2,73 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
-from enum import Enum
 from pathlib import Path
 from typing import Any, TypeVar
 
 import casadi as ca
-import cloudpickle
 import numpy as np
 from numpy.typing import NDArray
 
 from dscp_core.errors import InvalidInputError
+from dscp_core.problem import checks
+from dscp_core.problem.algorithm import (
+    TRUST_REGION_CONTROL,
+    TRUST_REGION_STATE,
+    TRUST_REGION_STEP,
+    VIRTUAL_CONTROL_WEIGHT,
+    algorithm_parameters,
+)
+from dscp_core.problem.elements import (
+    ConeConstraint,
+    Constraint,
+    CostTerm,
+    InitialGuess,
+    Miss,
+    Parameters,
+    PathConstraint,
+    Quadrature,
+    StagePoint,
+    Variable,
+    Where,
+)
 from dscp_core.problem.extras import Extras
 from dscp_core.problem.parameters import Parameter, ParameterTable, Value, load_parameter_file
 
 Symbol = TypeVar("Symbol", ca.SX, ca.MX)
 
+__all__ = [
+    "DERIVED_COSTS",
+    "TERMINAL_TIME",
+    "TRUST_REGION_CONTROL",
+    "TRUST_REGION_STATE",
+    "TRUST_REGION_STEP",
+    "VIRTUAL_CONTROL_WEIGHT",
+    "ConeConstraint",
+    "Constraint",
+    "CostTerm",
+    "InitialGuess",
+    "Miss",
+    "OptimalControlProblem",
+    "Parameters",
+    "PathConstraint",
+    "Quadrature",
+    "StagePoint",
+    "Variable",
+    "Where",
+    "named",
+]
+
 TERMINAL_TIME = "terminal_time"
-VIRTUAL_CONTROL_WEIGHT = "virtual_control_weight"
-TRUST_REGION_STATE = "trust_region_state"
-TRUST_REGION_CONTROL = "trust_region_control"
-TRUST_REGION_STEP = "trust_region_step"
-
-
-@dataclass(frozen=True)
-class Variable:
-    """A state or control component.
-
-    Attributes:
-        name: Unique name.
-        unit: SI unit.
-        scale: SI value of one scaled unit; the subproblems are solved in scaled units.
-        description: What it is.
-    """
-
-    name: str
-    unit: str
-    scale: float
-    description: str
-
-    def __post_init__(self) -> None:
-        if not self.scale > 0.0:
-            raise InvalidInputError(f"scale of {self.name}", self.scale, "> 0")
-
-
-class Where(Enum):
-    """Where along the trajectory an expression is imposed."""
-
-    NODE = "node"
-    MEAN = "interval mean"
-
-
-@dataclass(frozen=True)
-class StagePoint:
-    """Symbols at one node or interval mean; all are CasADi SX in SI units.
-
-    Attributes:
-        x: State, (nx, 1).
-        u: Control, (nu, 1).
-        step: Interval length T in seconds.
-    """
-
-    x: ca.SX
-    u: ca.SX
-    step: ca.SX
-
-
-Parameters = Mapping[str, ca.SX]
-
-
-@dataclass(frozen=True)
-class Constraint:
-    """What path and cone constraints have in common.
-
-    Attributes:
-        name: Name in reports.
-        expression: Of a point and the parameters, SI; what it returns is the subclass's matter.
-        scale: SI magnitude by which the rows are divided.
-        unit: Unit of the expression.
-        where: Node or interval mean.
-        skip_first: Leave out the first node or interval (its state is pinned).
-        skip_last: Leave out the last node or interval.
-        tolerance: Violation of the flown trajectory that a certificate accepts, in ``unit``; a
-            function of the parameters' values where it grows with the vehicle.
-    """
-
-    name: str
-    expression: Callable[[StagePoint, Parameters], ca.SX]
-    scale: float
-    unit: str
-    where: Where = Where.NODE
-    skip_first: bool = False
-    skip_last: bool = False
-    tolerance: float | Callable[[Mapping[str, Any]], float] = 0.0
-
-    def accepted(self, values: Mapping[str, Any]) -> float:
-        """The tolerance for a vehicle's values by name."""
-        return self.tolerance(values) if callable(self.tolerance) else self.tolerance
-
-
-class PathConstraint(Constraint):
-    """``g(x, u, p) <= 0`` with the scalar g as the expression, linearised (eq. 7)."""
-
-
-class ConeConstraint(Constraint):
-    """``|g1(x, u, p)|_2 <= g0(x, u, p)``, affine in (x, u); the expression is [g0; g1]."""
-
-
-@dataclass(frozen=True)
-class Miss:
-    """A distance from the target at the end of the flown trajectory.
-
-    Attributes:
-        name: Name in reports.
-        expression: ``(x(t_f), p)`` to a nonnegative scalar, SI.
-        unit: Its unit.
-        tolerance: Largest value that a certificate accepts.
-    """
-
-    name: str
-    expression: Callable[[ca.SX, Parameters], ca.SX]
-    unit: str
-    tolerance: float
-
-
-@dataclass(frozen=True)
-class CostTerm:
-    """A cost of the subproblem, summed over nodes or interval means.
-
-    Attributes:
-        name: Name in reports.
-        expression: Returns a scalar, at most quadratic and convex in the decision; arguments are
-            the decision's point, the reference's point and the parameters. Units of the cost.
-        where: Node or interval mean.
-    """
-
-    name: str
-    expression: Callable[[StagePoint, StagePoint, Parameters], ca.SX]
-    where: Where = Where.MEAN
-
-
-@dataclass(frozen=True)
-class InitialGuess:
-    """Reference trajectory of the first iteration, as CasADi expressions of the parameters.
-
-    Attributes:
-        states: (nx, N+1), SI.
-        controls: (nu, N+1), SI.
-    """
-
-    states: ca.MX
-    controls: ca.MX
+DERIVED_COSTS = (
+    "running_cost",
+    "terminal_cost",
+    "trust_region",
+    "trust_region_step",
+    "virtual_control",
+)
+"""Names of the costs of a subproblem that are no declared terms."""
 
 
 @dataclass(frozen=True)
@@ -168,17 +83,14 @@ class OptimalControlProblem:
         dynamics: ``f(x, u, p)``, (nx, 1), SI (eq. 1).
         initial_state: Value of every state at the start, (nx, 1).
         final_state: Pinned states at the end by name.
-        terminal_cost: Mayer term Phi(x(t_f), t_f, p); linearised.
-        running_cost: Lagrange term Theta(x, u, p) of the true cost, summed as
-            ``T * sum over nodes``, or None; what a subproblem minimises of it stands in
-            ``cost_terms``.
         cost_unit: Unit of the cost; "1" for a pure number.
         cost_scale: Cost of one scaled unit.
         cost_magnitude: Cost below which its changes are judged in units of this instead of
             relative to it; None for `cost_scale`.
         cost_tolerance: Default bound on the relative change of the cost at convergence.
         defect_tolerance: Default bound on the defects there, relative to the states' scales.
-        cost_terms: Further subproblem costs (curvature, prox, quadratic running cost).
+        cost_terms: Further subproblem costs: curvature, proximal terms, or a model of the running
+            cost in place of the derived one.
         path_constraints: Linearised constraints.
         cone_constraints: Second-order cones.
         virtual_control_scale: SI size of one unit of virtual control per state, 0 for a state
@@ -193,6 +105,12 @@ class OptimalControlProblem:
             so that their sum over the nodes approximates an integral, whatever N.
         default_intervals: Number N of intervals that suits the problem.
         initial_guess: Builds the first reference for N intervals, as CasADi MX of the parameters.
+        terminal_cost: Mayer term Phi(x(t_f), t_f, p), or None. A subproblem minimises it as it is
+            where it is quadratic and convex, else its convexified second-order expansion.
+        running_cost: Lagrange term Theta(x, u, p) of the true cost, or None. A subproblem
+            minimises what ``cost_terms`` make of it, else the same as of the terminal cost, the
+            product of the changes of Theta and T left out.
+        quadrature: How the running cost is summed over the nodes.
         free_terminal_time: Whether the terminal time is a decision unless asked otherwise.
         terminal_time_bounds: Least and greatest terminal time when it is free, or None.
         initial_state_parameters: Names of the parameters that hold the initial state; their
@@ -219,13 +137,14 @@ class OptimalControlProblem:
     dynamics: Callable[[ca.SX, ca.SX, Parameters], ca.SX]
     initial_state: Callable[[Parameters], ca.SX]
     final_state: Mapping[str, Callable[[Parameters], ca.SX]]
-    terminal_cost: Callable[[ca.SX, ca.SX, Parameters], ca.SX]
     cost_scale: float
     initial_guess: Callable[[Mapping[str, ca.MX], int], InitialGuess]
     default_intervals: int = 50
     free_terminal_time: bool = False
     terminal_time_bounds: Callable[[Parameters], tuple[ca.SX, ca.SX]] | None = None
+    terminal_cost: Callable[[ca.SX, ca.SX, Parameters], ca.SX] | None = None
     running_cost: Callable[[ca.SX, ca.SX, Parameters], ca.SX] | None = None
+    quadrature: Quadrature = Quadrature.TRAPEZOID
     cost_unit: str = "1"
     cost_magnitude: float | None = None
     cost_tolerance: float = 1e-8
@@ -255,26 +174,90 @@ class OptimalControlProblem:
     table: ParameterTable = field(init=False)
 
     def __post_init__(self) -> None:
+        for label, kind in _MEMBERS.items():
+            object.__setattr__(self, label, checks.members(label, getattr(self, label), kind))
         nx, nu = len(self.states), len(self.controls)
-        for label, values, size in (
-            ("virtual_control_scale", self.virtual_control_scale, nx),
-            ("trust_region_state", self.trust_region_state, nx),
-            ("trust_region_control", self.trust_region_control, nu),
-            ("control_states", self.control_states, nu),
+        if not nx or not nu:
+            missing = "controls" if nx else "states"
+            raise InvalidInputError(missing, (), "at least one Variable")
+        for label, size in (
+            ("virtual_control_scale", nx),
+            ("trust_region_state", nx),
+            ("trust_region_control", nu),
+            ("control_states", nu),
         ):
-            if values and len(values) != size:
-                raise InvalidInputError(label, values, f"length {size}")
-        unknown = sorted(set(self.final_state) - {s.name for s in self.states})
+            object.__setattr__(self, label, checks.numbers(label, getattr(self, label), size))
+        for label in _POSITIVE:
+            checks.positive(label, getattr(self, label))
+        if self.cost_magnitude is not None:
+            checks.positive("cost_magnitude", self.cost_magnitude)
+        if any(self.virtual_control_scale):
+            checks.positive("virtual_control_weight", self.virtual_control_weight)
+        self._check_functions()
+        self._check_names()
+        table = ParameterTable(
+            (
+                *self.parameters,
+                *algorithm_parameters(
+                    self.trust_region_state or (0.0,) * nx,
+                    self.trust_region_control or (0.0,) * nu,
+                    self.trust_region_step,
+                    self.virtual_control_weight if any(self.virtual_control_scale) else None,
+                    "1/s" if self.trust_region_per_second else "1",
+                ),
+            )
+        )
+        object.__setattr__(self, "table", table)
+        self._check_parameters()
+
+    def _check_names(self) -> None:
+        limits = [c.name for c in (*self.path_constraints, *self.cone_constraints)]
+        checks.distinct("states and controls", (v.name for v in (*self.states, *self.controls)))
+        checks.distinct("constraints and misses", [*limits, *(m.name for m in self.misses)])
+        checks.distinct("constraints", limits, reserved=(TERMINAL_TIME,))
+        checks.distinct("cost_terms", (t.name for t in self.cost_terms), reserved=DERIVED_COSTS)
+        unknown = sorted(set(self.final_state) - {s.name for s in self.states}, key=str)
         if unknown:
             raise InvalidInputError("final_state", unknown, "names of states")
-        table = ParameterTable((*self.parameters, *self._scp_parameters()))
-        table[TERMINAL_TIME]
-        object.__setattr__(self, "table", table)
+        acted_on = [index for index in self.control_states if index not in range(len(self.states))]
+        if acted_on:
+            raise InvalidInputError("control_states", acted_on, f"[0, {len(self.states) - 1}]")
+
+    def _check_functions(self) -> None:
+        if not isinstance(self.final_state, Mapping):
+            raise InvalidInputError("final_state", self.final_state, "a mapping of names")
+        given = {name: getattr(self, name) for name in _FUNCTIONS}
+        given |= {name: getattr(self, name) for name in _OPTIONAL_FUNCTIONS}
+        given |= {f"final_state {name}": value for name, value in self.final_state.items()}
+        for name, value in given.items():
+            if value is not None or name not in _OPTIONAL_FUNCTIONS:
+                checks.function(name, value)
+        if not (isinstance(self.default_intervals, int) and self.default_intervals >= 2):
+            raise InvalidInputError("default_intervals", self.default_intervals, ">= 2")
+
+    def _check_parameters(self) -> None:
+        """Defaults, the terminal time, and the parameters that are named elsewhere."""
+        for parameter in self.table.parameters:
+            parameter.validate(parameter.default)
+        if self.table[TERMINAL_TIME].is_vector:
+            raise InvalidInputError(TERMINAL_TIME, self.table[TERMINAL_TIME].default, "a number")
+        checks.positive(TERMINAL_TIME, self.table[TERMINAL_TIME].default)
+        checks.distinct("initial_state_parameters", self.initial_state_parameters)
+        size = sum(self.table[name].size for name in self.initial_state_parameters)
+        if self.initial_state_parameters and size != len(self.states):
+            bound = f"{len(self.states)} components, one per state, not {size}"
+            raise InvalidInputError(
+                "initial_state_parameters", self.initial_state_parameters, bound
+            )
+        for name, value in self.least_time_parameters.items():
+            self.table[name].validate(value)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle with lambdas and closures, which plain pickle refuses."""
-        given = {f.name: getattr(self, f.name) for f in fields(self) if f.init}
-        return _restored, (cloudpickle.dumps(given),)
+        """By value, lambdas and closures included: workers get the problem itself."""
+        from dscp_core.problem import pickling
+
+        declared = {f.name: getattr(self, f.name) for f in fields(self) if f.init}
+        return _restored, pickling.to_bytes(declared)
 
     def pack(self, values: Mapping[str, Value] | None = None) -> NDArray[np.float64]:
         """Packed parameters, SI: the defaults overridden by ``values``.
@@ -329,55 +312,34 @@ class OptimalControlProblem:
             if p.fixes_optimum and p.name not in others
         }
 
-    def _scp_parameters(self) -> Sequence[Parameter]:
-        """Parameters of the algorithm (theta_SCP), appended to those of the problem."""
-        nx, nu = len(self.states), len(self.controls)
-        unit = "1/s" if self.trust_region_per_second else "1"
-        parameters = [
-            Parameter(
-                TRUST_REGION_STATE,
-                self.trust_region_state or (0.0,) * nx,
-                unit,
-                "Trust-region penalty per state, scaled cost per squared scaled state.",
-                lower=0.0,
-                fixes_optimum=False,
-            ),
-            Parameter(
-                TRUST_REGION_CONTROL,
-                self.trust_region_control or (0.0,) * nu,
-                unit,
-                "Trust-region penalty per control, scaled cost per squared scaled control.",
-                lower=0.0,
-                fixes_optimum=False,
-            ),
-            Parameter(
-                TRUST_REGION_STEP,
-                self.trust_region_step,
-                "1",
-                "Trust-region penalty on the terminal time, when it is free, scaled cost per "
-                "squared relative change.",
-                lower=0.0,
-                fixes_optimum=False,
-            ),
-        ]
-        if any(self.virtual_control_scale):
-            parameters.append(
-                Parameter(
-                    VIRTUAL_CONTROL_WEIGHT,
-                    self.virtual_control_weight,
-                    "1",
-                    "Penalty of the squared virtual control, in units of the cost.",
-                    lower=0.0,
-                    fixes_optimum=False,
-                )
-            )
-        return parameters
+
+_MEMBERS: Mapping[str, type] = {
+    "states": Variable,
+    "controls": Variable,
+    "parameters": Parameter,
+    "cost_terms": CostTerm,
+    "path_constraints": PathConstraint,
+    "cone_constraints": ConeConstraint,
+    "misses": Miss,
+}
+_POSITIVE = ("cost_scale", "cost_tolerance", "defect_tolerance", "virtual_control_tolerance")
+_FUNCTIONS = ("dynamics", "initial_state", "initial_guess")
+_OPTIONAL_FUNCTIONS = (
+    "terminal_cost",
+    "running_cost",
+    "terminal_time_bounds",
+    "check_parameters",
+    "check_state",
+    "terminal_time_guess",
+)
+
+
+def _restored(pickled: bytes, count: int, expressions: str) -> OptimalControlProblem:
+    from dscp_core.problem import pickling
+
+    return OptimalControlProblem(**pickling.from_bytes(pickled, count, expressions))
 
 
 def named(problem: OptimalControlProblem, packed: Symbol) -> dict[str, Symbol]:
     """Parameters by name from their packed symbol."""
     return {name: packed[problem.table.slice(name)] for name in problem.table.names}
-
-
-def _restored(pickled: bytes) -> OptimalControlProblem:
-    return OptimalControlProblem(**cloudpickle.loads(pickled))

@@ -31,6 +31,7 @@ class Parameter:
         source: Where the default comes from.
         fixes_optimum: Whether the optimum from a state depends on it; not so for a bound on a
             guess, or a setting of the method.
+        infinite: Whether values may be infinite: for a bound, which is then none.
     """
 
     name: str
@@ -41,6 +42,7 @@ class Parameter:
     upper: float = math.inf
     source: str = ""
     fixes_optimum: bool = True
+    infinite: bool = False
 
     @property
     def size(self) -> int:
@@ -56,7 +58,8 @@ class Parameter:
         """Check a value and return it as an array of shape (size,).
 
         Raises:
-            InvalidInputError: Not numeric, of the wrong length, not finite, or out of bounds.
+            InvalidInputError: Not numeric, of the wrong length, NaN, infinite where that is not
+                declared, or out of bounds.
         """
         try:
             given = np.atleast_1d(np.asarray(value))
@@ -67,7 +70,10 @@ class Parameter:
         array = given.astype(np.float64)
         if array.shape != (self.size,):
             raise InvalidInputError(self.name, value, f"length {self.size}")
-        if not np.all(np.isfinite(array)):
+        if self.infinite:
+            if np.any(np.isnan(array)):
+                raise InvalidInputError(self.name, value, "no NaN")
+        elif not np.all(np.isfinite(array)):
             raise InvalidInputError(self.name, value, "finite")
         if np.any(array < self.lower) or np.any(array > self.upper):
             raise InvalidInputError(

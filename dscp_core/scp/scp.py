@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dscp_core.cone.convexity import NotConvexError
 from dscp_core.cone.derivative.sensitivity import KktSystem
 from dscp_core.cone.program import ConePattern, ConeSolution, ConeValues, SolveStatus
 from dscp_core.cone.solvers import SolverSettings, make_solver
@@ -110,6 +111,10 @@ class Scp:
             self.options.solver, transcription.pattern, self.options.solver_settings
         )
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """By what it was made of; the copy has a solver and symbolic work of its own."""
+        return Scp, (self.transcription, self.options)
+
     @property
     def cost_tolerance(self) -> float:
         """Bound on the relative change of the cost: of the options, or else of the problem."""
@@ -179,9 +184,8 @@ class _Run:
             raise InvalidInputError(
                 "initial_reference", f"shape {self._initial.shape}", f"shape ({expected},)"
             )
-        if not np.all(np.isfinite(self._initial)):
-            what = "initial_reference" if self._warm else "the problem's initial guess"
-            raise InvalidInputError(what, "NaN or Inf", "finite")
+        what = "initial_reference" if self._warm else "the problem's initial guess"
+        self._transcription.require_finite(self._initial, what)
         problem = self._transcription.problem
         self._test = StoppingTest(
             rule=self._options.stopping,
@@ -205,7 +209,7 @@ class _Run:
                 return self._finish(ScpStatus.DEADLINE, "no time for another iteration")
             try:
                 iteration, evaluation = self._iterate(reference, evaluation, remaining)
-            except InvalidInputError as error:  # the solvers refuse data that are not finite
+            except InvalidInputError as error:  # not finite, or not convex
                 return self._finish(ScpStatus.DIVERGED, f"{self._progress()}; {error}")
             if isinstance(iteration, ConeSolution):
                 return self._failure(iteration, reference)
@@ -232,7 +236,10 @@ class _Run:
         started = time.perf_counter()
         values = transcription.values(reference, self._parameters)
         assembled = time.perf_counter()
-        solution = self._scp.solve(values, time_limit_s)
+        try:
+            solution = self._scp.solve(values, time_limit_s)
+        except NotConvexError:
+            raise transcription.not_convex(reference, self._parameters) from None
         solved = time.perf_counter()
         if solution.status is not SolveStatus.SOLVED:
             return solution, before
@@ -292,6 +299,10 @@ class _Run:
             return self._finish(ScpStatus.DEADLINE, message, solution)
         if solution.status is SolveStatus.INFEASIBLE:
             return self._finish(ScpStatus.SUBPROBLEM_INFEASIBLE, message, solution)
+        if solution.status is SolveStatus.UNBOUNDED:
+            along = self._transcription.largest_entry(solution.z[: reference.size])
+            message += f"; it lacks a bound or a trust-region weight, above all for {along}"
+            return self._finish(ScpStatus.SOLVER_FAILURE, message, solution)
         status, reason = self._diagnose(reference)
         return self._finish(status, f"{message}; {reason}", solution)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import casadi as ca
@@ -11,9 +10,16 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from dscp_core.cone.program import ConePattern, CscPattern
-from dscp_core.problem.declaration import ConeConstraint, Constraint, OptimalControlProblem, Where
+from dscp_core.problem.declaration import (
+    TERMINAL_TIME,
+    ConeConstraint,
+    Constraint,
+    OptimalControlProblem,
+    Where,
+)
 from dscp_core.transcription.layout import TrajectoryLayout
-from dscp_core.transcription.stages import Block, Kind, Stage, StageFunctions
+from dscp_core.transcription.stage import Block, Kind, Stage
+from dscp_core.transcription.stages import StageFunctions
 
 Indices = NDArray[np.int64]
 
@@ -36,7 +42,7 @@ class RowGroup:
 
 
 class ValueScatter:
-    """Sparse 0/1 matrix from stage outputs to values ``[q, c, a, b, g, h]``, and the pattern.
+    """Sparse matrix from stage outputs to values ``[q, c, a, b, g, h]``, and the pattern.
 
     Attributes:
         pattern: Sparsity of the subproblems.
@@ -69,9 +75,9 @@ class ValueScatter:
         layout = self._layout
         groups: list[RowGroup] = []
         start = 0
-        terminal = any(block.group == "terminal_time" for block in self._stages.terminal.blocks)
+        terminal = any(block.group == TERMINAL_TIME for block in self._stages.terminal.blocks)
         if terminal:
-            groups.append(RowGroup("terminal_time", 0, 1, np.zeros(2, int)))
+            groups.append(RowGroup(TERMINAL_TIME, 0, 1, np.zeros(2, int)))
             start = 2
         every: list[Constraint] = [
             *self._problem.path_constraints,
@@ -123,16 +129,14 @@ class ValueScatter:
             (stages.node, layout.intervals + 1),
         ):
             places = np.arange(count)
-            for start, block in _offsets(stage):
-                entries = np.arange(start, start + block.rows.size)
+            for block, entries in stage.located():
                 self._add_block(
                     stage, block, places, source + places[:, None] * stage.size + entries
                 )
             source += count * stage.size
         last = np.array([layout.intervals])
-        for start, block in _offsets(stages.terminal):
-            entries = source + np.arange(start, start + block.rows.size)
-            self._add_block(stages.terminal, block, last, entries[None, :])
+        for block, entries in stages.terminal.located():
+            self._add_block(stages.terminal, block, last, source + entries[None, :])
         source += stages.terminal.size
         self._add_boundary(source, width)
         self._add_virtual_control()
@@ -140,13 +144,14 @@ class ValueScatter:
     def _add_block(self, stage: Stage, block: Block, places: Indices, sources: Indices) -> None:
         """One block at every place where it is imposed; sources is (places, entries)."""
         columns = self._columns(block.columns if block.columns.size else block.rows, places)
+        factor = self._stages.weights[places][:, None] if block.weighted else 1.0
         if block.kind is Kind.COST_VECTOR:
             columns = self._columns(block.rows, places)
-            self._add(block.kind, columns, np.zeros_like(columns), sources)
+            self._add(block.kind, columns, np.zeros_like(columns), sources, factor)
             return
         if block.kind is Kind.COST_MATRIX:
             rows = self._columns(block.rows, places)
-            self._add(block.kind, rows, columns, sources)
+            self._add(block.kind, rows, columns, sources, factor)
             return
         if block.kind in (Kind.EQUALITY_MATRIX, Kind.EQUALITY_VECTOR):
             rows = places[:, None] * self._layout.nx + block.rows
@@ -181,7 +186,7 @@ class ValueScatter:
                 columns = np.arange(layout.reference_size, layout.size)
                 self._add(Kind.COST_MATRIX, columns, columns, entries)
                 continue
-            if block.group == "initial":
+            if block.group == "initial_state":
                 states, node = np.arange(nx), 0
             else:
                 states, node = np.array(self._final, int), layout.intervals
@@ -244,10 +249,3 @@ class ValueScatter:
     def _vector(self, kind: Kind, size: int) -> sp.csc_matrix:
         rows, _, sources, factors = self._gathered(kind)
         return sp.csc_matrix((factors, (rows, sources)), shape=(size, self._one + 1))
-
-
-def _offsets(stage: Stage) -> Iterator[tuple[int, Block]]:
-    start = 0
-    for block in stage.blocks:
-        yield start, block
-        start += block.rows.size

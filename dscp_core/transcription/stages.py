@@ -6,9 +6,8 @@ go. They are mapped over the trajectory, so that their size does not grow with N
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
-from enum import Enum
+from collections.abc import Iterable
+from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
@@ -22,126 +21,50 @@ from dscp_core.problem.declaration import (
     TRUST_REGION_STEP,
     VIRTUAL_CONTROL_WEIGHT,
     Constraint,
-    CostTerm,
+    InitialGuess,
     OptimalControlProblem,
     PathConstraint,
-    StagePoint,
     Where,
     named,
 )
+from dscp_core.problem.tracing import called
+from dscp_core.transcription.analysis import CostAnalysis, CostForm, analyse
+from dscp_core.transcription.costs import (
+    add_running_cost,
+    add_terminal_cost,
+    add_terms,
+    node_weights,
+    running_cost,
+    terminal_cost,
+)
 from dscp_core.transcription.layout import TrajectoryLayout
+from dscp_core.transcription.stage import Collector, Kind, Stage, Symbols
 
-Indices = NDArray[np.int64]
+Array = NDArray[np.float64]
 
-
-class Kind(Enum):
-    """Which value array a nonzero belongs to."""
-
-    COST_MATRIX = "q"
-    COST_VECTOR = "c"
-    EQUALITY_MATRIX = "a"
-    EQUALITY_VECTOR = "b"
-    CONE_MATRIX = "g"
-    CONE_VECTOR = "h"
-
-
-@dataclass(frozen=True)
-class Block:
-    """Consecutive entries of a stage's output that belong together.
-
-    Attributes:
-        kind: Target array.
-        group: Constraint that owns the rows, or "" for cost and dynamics.
-        rows: Local row of each entry (local column of the cost vector's entries).
-        columns: Local column of each entry; empty for vectors.
-    """
-
-    kind: Kind
-    group: str
-    rows: Indices
-    columns: Indices
-
-
-@dataclass
-class Stage:
-    """A compiled stage and the meaning of its output.
-
-    Attributes:
-        function: (local reference vector, parameters) -> dense column.
-        blocks: Meaning of the output's entries, in order.
-    """
-
-    function: ca.Function
-    blocks: tuple[Block, ...]
-
-    @property
-    def size(self) -> int:
-        """Length of the output column."""
-        return sum(block.rows.size for block in self.blocks)
-
-
-@dataclass
-class _Collector:
-    """Gathers expressions and their blocks while a stage is built."""
-
-    blocks: list[Block] = field(default_factory=list)
-    parts: list[ca.SX] = field(default_factory=list)
-
-    def matrix(self, kind: Kind, group: str, matrix: ca.SX) -> None:
-        rows, columns = matrix.sparsity().get_triplet()
-        self.blocks.append(Block(kind, group, np.array(rows, int), np.array(columns, int)))
-        self.parts.append(ca.vec(matrix.nz[:]))
-
-    def vector(self, kind: Kind, group: str, vector: ca.SX) -> None:
-        rows = np.arange(vector.numel())
-        self.blocks.append(Block(kind, group, rows, np.zeros(0, int)))
-        self.parts.append(ca.densify(vector))
-
-    def stage(self, name: str, reference: ca.SX, parameters: ca.SX) -> Stage:
-        column = ca.cse(ca.vertcat(*self.parts))
-        return Stage(ca.Function(name, [reference, parameters], [column]), tuple(self.blocks))
-
-
-class _Symbols:
-    """Local symbols: decision, reference and parameters of a stage with one or two nodes."""
-
-    def __init__(self, problem: OptimalControlProblem, layout: TrajectoryLayout, nodes: int):
-        size = layout.offset + nodes * (layout.nx + layout.nu)
-        self._layout = layout
-        self.packed = ca.SX.sym("p", problem.table.size)
-        self.parameters = named(problem, self.packed)
-        self.decision = ca.SX.sym("z", size)
-        self.reference = ca.SX.sym("z_ref", size)
-
-    def nodes(self, vector: ca.SX) -> list[StagePoint]:
-        """Points at the nodes that a local scaled vector holds, in SI."""
-        layout = self._layout
-        step = self.terminal_time(vector) / layout.intervals
-        points = []
-        for start in range(layout.offset, vector.numel(), layout.nx + layout.nu):
-            x = vector[start : start + layout.nx] * ca.DM(layout.state_scale)
-            u = vector[start + layout.nx : start + layout.nx + layout.nu]
-            points.append(StagePoint(x, u * ca.DM(layout.control_scale), step))
-        return points
-
-    def mean(self, vector: ca.SX) -> StagePoint:
-        """Point at the interval mean."""
-        first, second = self.nodes(vector)
-        return StagePoint((first.x + second.x) / 2, (first.u + second.u) / 2, first.step)
-
-    def terminal_time(self, vector: ca.SX) -> ca.SX:
-        """Terminal time in seconds: a decision, or the parameter."""
-        if self._layout.free_terminal_time:
-            return vector[0] * self._layout.time_scale
-        return self.parameters[TERMINAL_TIME]
+# Those of 220 states that all act on each other; they take 10 s.
+_MOST_NONZEROS = 100_000
 
 
 @dataclass(frozen=True)
 class StageFunctions:
-    """All stages of a problem, and how to evaluate them along a trajectory."""
+    """All stages of a problem, and how to evaluate them along a trajectory.
+
+    Attributes:
+        problem: The declaration.
+        layout: Where quantities stand in the decision vector.
+        costs: What the costs are.
+        weights: (N+1,) the quadrature's weight of every node.
+        interval: Stage of an interval.
+        node: Stage of a node.
+        terminal: Stage of the end.
+        boundary: Stage of what is pinned, and of the virtual control.
+    """
 
     problem: OptimalControlProblem
     layout: TrajectoryLayout
+    costs: CostAnalysis
+    weights: Array
     interval: Stage
     node: Stage
     terminal: Stage
@@ -180,164 +103,237 @@ class StageFunctions:
         """True cost, and defects (nx, N) in SI."""
         nodes, intervals = self._locals(reference)
         cost = self._terminal_cost(nodes[:, -1], parameters)
-        if self.problem.running_cost is not None:
-            cost += ca.sum2(self._map(self._running_cost, nodes, parameters))
+        if self.costs.running is not CostForm.NONE:
+            at_nodes = self.costs.where is Where.NODE
+            places = nodes if at_nodes else intervals
+            weights = ca.DM(self.weights if at_nodes else np.ones(self.layout.intervals))
+            cost += ca.mtimes(self._map(self._running_cost, places, parameters), weights)
         return cost, self._map(self._defect, intervals, parameters)
 
     def initial_guess(self, parameters: ca.MX) -> ca.MX:
-        """Scaled reference vector of the first iteration."""
+        """Reference vector of the first iteration."""
         layout = self.layout
-        values = named(self.problem, parameters)
-        guess = self.problem.initial_guess(values, layout.intervals)
+        guess = initial_guess(self.problem, layout.intervals, parameters)
         nodes = ca.vertcat(
             guess.states / ca.DM(layout.state_scale), guess.controls / ca.DM(layout.control_scale)
         )
         if layout.free_terminal_time:
-            return ca.vertcat(values[TERMINAL_TIME] / layout.time_scale, ca.vec(nodes))
+            time = parameters[self.problem.table.slice(TERMINAL_TIME)]
+            return ca.vertcat(time / layout.time_scale, ca.vec(nodes))
         return ca.vec(nodes)
 
 
+def initial_guess(
+    problem: OptimalControlProblem, intervals: int, parameters: ca.MX
+) -> InitialGuess:
+    """States (nx, N+1) and controls (nu, N+1) of the declared guess, dense, SI.
+
+    Raises:
+        InvalidInputError: The function raises, or returns something else.
+    """
+    what, values = "initial_guess", named(problem, parameters)
+    guess = called(what, problem.table, problem.initial_guess, values, intervals)
+    if not isinstance(guess, InitialGuess):
+        raise InvalidInputError(what, f"a {type(guess).__name__}", "an InitialGuess")
+    parts = []
+    for name, size in (("states", len(problem.states)), ("controls", len(problem.controls))):
+        given = getattr(guess, name)
+        if not isinstance(given, ca.MX | ca.DM | np.ndarray):
+            got = f"a {type(given).__name__}"
+            raise InvalidInputError(f"{name} of {what}", got, "a casadi.MX of the parameters")
+        part = called(f"{name} of {what}", problem.table, ca.MX, given)
+        if part.shape != (size, intervals + 1):
+            bound = f"shape ({size}, {intervals + 1})"
+            raise InvalidInputError(f"{name} of {what}", f"shape {part.shape}", bound)
+        parts.append(ca.densify(part))
+    traced = ca.Function("guess", [parameters], parts, {"allow_free": True})
+    foreign = ", ".join(sorted(str(symbol) for symbol in traced.free_mx()))
+    if foreign:
+        raise InvalidInputError(what, foreign, "symbols of its arguments only")
+    return InitialGuess(*parts)
+
+
 def build_stages(problem: OptimalControlProblem, layout: TrajectoryLayout) -> StageFunctions:
-    """Derive every stage of a problem: linearisation (eqs. 6 to 8) and quadratic costs."""
-    pair, single = _Symbols(problem, layout, 2), _Symbols(problem, layout, 1)
+    """Derive every stage of a problem: linearisation (eqs. 6 to 8) and quadratic costs.
+
+    Raises:
+        InvalidInputError: A function of the declaration is wrong.
+    """
+    pair, single = Symbols(problem, layout, 2), Symbols(problem, layout, 1)
     defect = _defect(problem, pair)
-    terminal_cost = problem.terminal_cost(
-        single.nodes(single.reference)[0].x,
-        single.terminal_time(single.reference),
-        single.parameters,
-    )
-    running = ca.SX(0)
-    if problem.running_cost is not None:
-        point = single.nodes(single.reference)[0]
-        running = point.step * problem.running_cost(point.x, point.u, single.parameters)
-    arguments = [single.reference, single.packed]
+    packed = ca.MX.sym("parameters", problem.table.size)
+    guess = initial_guess(problem, layout.intervals, packed)
+    guessed = ca.Function("guess", [packed], [guess.states.T, guess.controls.T])
+
+    def numbers(parameters: Array) -> tuple[Array, Array]:
+        states, controls = guessed(parameters)
+        return states.full(), controls.full()
+
+    costs = analyse(problem, layout.intervals, numbers)
+    summed = single if costs.where is Where.NODE else pair
+    point = summed.at(costs.where, summed.reference)
     return StageFunctions(
         problem,
         layout,
-        _interval_stage(problem, layout, pair, defect),
-        _node_stage(problem, layout, single),
-        _terminal_stage(problem, layout, single, terminal_cost),
+        costs,
+        node_weights(problem.quadrature, layout.intervals),
+        _interval_stage(problem, layout, pair, defect, costs),
+        _node_stage(problem, layout, single, costs),
+        _terminal_stage(problem, layout, single, costs),
         _boundary_stage(problem, layout, single),
         ca.Function("defect", [pair.reference, pair.packed], [defect]),
-        ca.Function("running_cost", arguments, [running]),
-        ca.Function("terminal_cost", arguments, [terminal_cost]),
+        ca.Function(
+            "running_cost",
+            [summed.reference, summed.packed],
+            [point.step * running_cost(problem, summed, point)],
+        ),
+        ca.Function(
+            "terminal_cost",
+            [single.reference, single.packed],
+            [terminal_cost(problem, single, single.reference)],
+        ),
     )
 
 
-def _defect(problem: OptimalControlProblem, symbols: _Symbols) -> ca.SX:
+def _defect(problem: OptimalControlProblem, symbols: Symbols) -> ca.SX:
     """Residual of the discrete dynamics at the reference, eq. ch2-disdy, SI."""
     first, second = symbols.nodes(symbols.reference)
     mean = symbols.mean(symbols.reference)
-    return second.x - first.x - mean.step * problem.dynamics(mean.x, mean.u, symbols.parameters)
+    rates = symbols.trace(
+        "dynamics",
+        problem.dynamics,
+        mean.x,
+        mean.u,
+        symbols.parameters,
+        rows=len(problem.states),
+    )
+    return second.x - first.x - mean.step * rates
 
 
 def _interval_stage(
-    problem: OptimalControlProblem, layout: TrajectoryLayout, symbols: _Symbols, defect: ca.SX
+    problem: OptimalControlProblem,
+    layout: TrajectoryLayout,
+    symbols: Symbols,
+    defect: ca.SX,
+    costs: CostAnalysis,
 ) -> Stage:
-    collect = _Collector()
+    collect = Collector()
     residual = defect / ca.DM(layout.state_scale)
+    nonzeros = ca.jacobian_sparsity(residual, symbols.reference).nnz()
+    if nonzeros > _MOST_NONZEROS:
+        bound = f"at most {_MOST_NONZEROS} nonzeros: more take minutes to compile"
+        raise InvalidInputError("Jacobian of dynamics", nonzeros, bound)
     jacobian = ca.jacobian(residual, symbols.reference)
-    collect.matrix(Kind.EQUALITY_MATRIX, "", jacobian)
-    collect.vector(Kind.EQUALITY_VECTOR, "", ca.mtimes(jacobian, symbols.reference) - residual)
-    _add_stage(collect, problem, symbols, symbols.mean, Where.MEAN)
+    collect.matrix(Kind.EQUALITY_MATRIX, "dynamics", jacobian)
+    offset = ca.mtimes(jacobian, symbols.reference) - residual
+    collect.vector(Kind.EQUALITY_VECTOR, "dynamics", offset)
+    _add_constraints(collect, problem, symbols, Where.MEAN)
+    add_terms(collect, problem, symbols, costs, Where.MEAN)
     return collect.stage("interval", symbols.reference, symbols.packed)
 
 
 def _node_stage(
-    problem: OptimalControlProblem, layout: TrajectoryLayout, symbols: _Symbols
+    problem: OptimalControlProblem, layout: TrajectoryLayout, symbols: Symbols, costs: CostAnalysis
 ) -> Stage:
-    collect = _Collector()
-    _add_stage(collect, problem, symbols, lambda vector: symbols.nodes(vector)[0], Where.NODE)
+    collect = Collector()
+
+    _add_constraints(collect, problem, symbols, Where.NODE)
+    add_terms(collect, problem, symbols, costs, Where.NODE)
     change = symbols.decision[layout.offset :] - symbols.reference[layout.offset :]
+    if costs.running in (CostForm.EXACT, CostForm.CONVEXIFIED):
+        add_running_cost(collect, problem, symbols, costs.running)
     weights = ca.vertcat(
         symbols.parameters[TRUST_REGION_STATE], symbols.parameters[TRUST_REGION_CONTROL]
     )
     penalty = ca.dot(weights, change**2)
     if problem.trust_region_per_second:
-        penalty *= symbols.nodes(symbols.reference)[0].step
-    _add_quadratic(collect, "trust_region", penalty, symbols)
+        penalty *= symbols.node(symbols.reference).step
+    collect.quadratic("trust_region", penalty, symbols)
     return collect.stage("node", symbols.reference, symbols.packed)
 
 
 def _terminal_stage(
-    problem: OptimalControlProblem, layout: TrajectoryLayout, symbols: _Symbols, cost: ca.SX
+    problem: OptimalControlProblem, layout: TrajectoryLayout, symbols: Symbols, costs: CostAnalysis
 ) -> Stage:
-    collect = _Collector()
-    gradient = ca.gradient(cost, symbols.reference) / problem.cost_scale
-    collect.vector(Kind.COST_VECTOR, "", gradient)
+    collect = Collector()
+    decision, reference = symbols.decision, symbols.reference
+    if costs.terminal is not CostForm.NONE:
+        add_terminal_cost(collect, problem, symbols, costs.terminal)
     if layout.free_terminal_time:
-        relative = symbols.decision[0] / symbols.reference[0] - 1
+        relative = decision[0] / reference[0] - 1
         weight = symbols.parameters[TRUST_REGION_STEP]
-        _add_quadratic(collect, "trust_region_step", weight * relative**2, symbols)
+        collect.quadratic("trust_region_step", weight * relative**2, symbols)
         if problem.terminal_time_bounds is not None:
-            lower, upper = problem.terminal_time_bounds(symbols.parameters)
-            rows = ca.jacobian(
-                ca.vertcat(-symbols.decision[0], symbols.decision[0]), symbols.decision
+            lower, upper = symbols.trace.pair(
+                "terminal_time_bounds", problem.terminal_time_bounds, symbols.parameters
             )
-            collect.matrix(Kind.CONE_MATRIX, "terminal_time", rows)
+            rows = ca.jacobian(ca.vertcat(-decision[0], decision[0]), decision)
+            collect.matrix(Kind.CONE_MATRIX, TERMINAL_TIME, rows)
             bound = ca.vertcat(-lower, upper) / layout.time_scale
-            collect.vector(Kind.CONE_VECTOR, "terminal_time", bound)
-    return collect.stage("terminal", symbols.reference, symbols.packed)
+            collect.vector(Kind.CONE_VECTOR, TERMINAL_TIME, bound)
+    return collect.stage("terminal", reference, symbols.packed)
 
 
 def _boundary_stage(
-    problem: OptimalControlProblem, layout: TrajectoryLayout, symbols: _Symbols
+    problem: OptimalControlProblem, layout: TrajectoryLayout, symbols: Symbols
 ) -> Stage:
     """Pinned values of the first and last state, and the virtual-control penalty."""
-    collect = _Collector()
-    initial = problem.initial_state(symbols.parameters) / ca.DM(layout.state_scale)
-    collect.vector(Kind.EQUALITY_VECTOR, "initial", initial)
+    collect = Collector()
+    p, trace = symbols.parameters, symbols.trace
+    initial = trace("initial_state", problem.initial_state, p, rows=layout.nx)
+    scaled = initial / ca.DM(layout.state_scale)
+    collect.vector(Kind.EQUALITY_VECTOR, "initial_state", scaled)
     scales = {s.name: s.scale for s in problem.states}
     final = [
-        value(symbols.parameters) / scales[name] for name, value in problem.final_state.items()
+        trace(f"final_state {name}", value, p) / scales[name]
+        for name, value in problem.final_state.items()
     ]
-    collect.vector(Kind.EQUALITY_VECTOR, "final", ca.vertcat(*final))
+    collect.vector(Kind.EQUALITY_VECTOR, "final_state", ca.vertcat(*final))
     if layout.virtual_states.size:
-        weight = 2 * symbols.parameters[VIRTUAL_CONTROL_WEIGHT] / problem.cost_scale
+        weight = 2 * p[VIRTUAL_CONTROL_WEIGHT] / problem.cost_scale
         collect.vector(Kind.COST_MATRIX, "virtual_control", weight)
     return collect.stage("boundary", symbols.reference, symbols.packed)
 
 
-def _add_stage(
-    collect: _Collector,
-    problem: OptimalControlProblem,
-    symbols: _Symbols,
-    at: Callable[[ca.SX], StagePoint],
-    where: Where,
+def _add_constraints(
+    collect: Collector, problem: OptimalControlProblem, symbols: Symbols, where: Where
 ) -> None:
     reference = symbols.reference
     for constraint in constraints(problem, where):
-        value = constraint.expression(at(reference), symbols.parameters) / constraint.scale
+        linear = isinstance(constraint, PathConstraint)
+        what = f"constraint {constraint.name}"
+        value = symbols.trace(
+            what,
+            constraint.expression,
+            symbols.at(where, reference),
+            symbols.parameters,
+            rows=1 if linear else None,
+        )
+        value = value / constraint.scale
         jacobian = ca.jacobian(value, reference)
+        if not linear:
+            _require_cone(what, value, jacobian, reference)
+            value, jacobian = -value, -jacobian
+        collect.matrix(Kind.CONE_MATRIX, constraint.name, jacobian)
         offset = ca.mtimes(jacobian, reference) - value
-        if isinstance(constraint, PathConstraint):
-            collect.matrix(Kind.CONE_MATRIX, constraint.name, jacobian)
-            collect.vector(Kind.CONE_VECTOR, constraint.name, offset)
-        else:
-            collect.matrix(Kind.CONE_MATRIX, constraint.name, -jacobian)
-            collect.vector(Kind.CONE_VECTOR, constraint.name, -offset)
-    for term in _terms(problem, where):
-        expression = term.expression(at(symbols.decision), at(reference), symbols.parameters)
-        _add_quadratic(collect, term.name, expression / problem.cost_scale, symbols)
+        collect.vector(Kind.CONE_VECTOR, constraint.name, offset)
 
 
-def _add_quadratic(collect: _Collector, name: str, cost: ca.SX, symbols: _Symbols) -> None:
-    hessian, gradient = ca.hessian(cost, symbols.decision)
-    if ca.depends_on(hessian, symbols.decision):
-        raise InvalidInputError(f"cost term {name}", "Hessian depends on the decision", "quadratic")
-    collect.matrix(Kind.COST_MATRIX, "", ca.triu(hessian))
-    linear = ca.substitute(gradient, symbols.decision, ca.DM.zeros(symbols.decision.shape))
-    collect.vector(Kind.COST_VECTOR, "", linear)
+def _require_cone(what: str, value: ca.SX, jacobian: ca.SX, reference: ca.SX) -> None:
+    """Refuse what is no second-order cone of the decision.
+
+    Raises:
+        InvalidInputError: Fewer than two rows, or not affine.
+    """
+    if value.shape[0] < 2:
+        raise InvalidInputError(what, f"shape {value.shape}", "at least 2 rows, [g0; g1]")
+    for row in range(value.shape[0]):
+        if ca.depends_on(jacobian[row, :], reference):
+            bound = "affine in state, control and interval length"
+            raise InvalidInputError(what, f"row {row}, which is not", bound)
 
 
 def constraints(problem: OptimalControlProblem, where: Where) -> Iterable[Constraint]:
     """Constraints at nodes or at interval means, linear ones first."""
-    every: tuple[Constraint, ...] = (
-        *problem.path_constraints,
-        *problem.cone_constraints,
-    )
+    every: tuple[Constraint, ...] = (*problem.path_constraints, *problem.cone_constraints)
     return (constraint for constraint in every if constraint.where is where)
-
-
-def _terms(problem: OptimalControlProblem, where: Where) -> Iterable[CostTerm]:
-    return (term for term in problem.cost_terms if term.where is where)

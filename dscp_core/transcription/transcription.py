@@ -7,15 +7,19 @@ reverse-mode derivative is the vector-Jacobian product of eq. d3, second derivat
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from dscp_core.cone.convexity import NotConvexError
 from dscp_core.cone.program import ConePattern, ConeValues
 from dscp_core.errors import InvalidInputError
 from dscp_core.problem.declaration import TERMINAL_TIME, OptimalControlProblem
 from dscp_core.problem.parameters import ParameterTable
+from dscp_core.transcription import faults
+from dscp_core.transcription.analysis import CostAnalysis
 from dscp_core.transcription.compiled import CompiledFunction
 from dscp_core.transcription.layout import TrajectoryLayout
 from dscp_core.transcription.scatter import ValueScatter
@@ -44,6 +48,8 @@ class Transcription:
         problem: The declaration.
         layout: Where quantities stand in the decision vector.
         pattern: Fixed sparsity of every subproblem.
+        costs: What the subproblems minimise of the true costs.
+        cost_function: True cost of (scaled reference vector, packed parameters).
         table: Parameters, in the packing order of every ``parameters`` argument.
     """
 
@@ -63,10 +69,10 @@ class Transcription:
                 ``terminal_time`` is then its first guess only. None for the problem's default.
 
         Raises:
-            InvalidInputError: ``intervals`` below 2.
+            InvalidInputError: ``intervals`` below 2, or a function of the declaration is wrong.
         """
-        if intervals < 2:
-            raise InvalidInputError("intervals", intervals, ">= 2")
+        if not isinstance(intervals, int | np.integer) or intervals < 2:
+            raise InvalidInputError("intervals", intervals, "a whole number >= 2")
         self.problem = problem
         self.table: ParameterTable = problem.table
         time_scale = float(np.ravel(self.table[TERMINAL_TIME].default)[0])
@@ -74,7 +80,7 @@ class Transcription:
             state_scale=np.array([s.scale for s in problem.states]),
             control_scale=np.array([c.scale for c in problem.controls]),
             time_scale=time_scale,
-            intervals=intervals,
+            intervals=int(intervals),
             free_terminal_time=(
                 problem.free_terminal_time if free_terminal_time is None else free_terminal_time
             ),
@@ -83,7 +89,21 @@ class Transcription:
         stages = build_stages(problem, self.layout)
         scatter = ValueScatter(problem, self.layout, stages)
         self.pattern: ConePattern = scatter.pattern
+        self.costs: CostAnalysis = stages.costs
+        self._stages = stages
+        bounds = self.pattern.flat_offsets
+        self._parts = {
+            name: slice(bounds[i], bounds[i + 1]) for i, name in enumerate(ConeValues.FIELDS)
+        }
+        self._heads = np.arange(self.pattern.n_cone_rows) < self.pattern.n_nonnegative
+        self._heads[self.pattern.soc_starts] = True
         self._compile(stages, scatter)
+        self._bounded = self._has_every_bound()
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """By what it was made of; the copy compiles its own functions."""
+        free = self.layout.free_terminal_time
+        return _transcribed, (self.problem, self.layout.intervals, free)
 
     def _compile(self, stages: StageFunctions, scatter: ValueScatter) -> None:
         layout = self.layout
@@ -107,6 +127,7 @@ class Transcription:
         )
         cost, defects = stages.evaluation(reference, parameters)
         self._evaluation = CompiledFunction("evaluation", [reference, parameters], [cost, defects])
+        self.cost_function = ca.Function("true_cost", [reference, parameters], [cost])
         cost_gradient = ca.gradient(cost, both)
         self._cost_gradient = CompiledFunction(
             "cost_gradient",
@@ -129,15 +150,51 @@ class Transcription:
         )
 
     def values(self, reference: Array, parameters: Array) -> ConeValues:
-        """Values of the subproblem at a reference (the set B of section 3.2.1)."""
-        return ConeValues.from_flat(self.pattern, self._values(reference, parameters)[0])
+        """Values of the subproblem at a reference (the set B of section 3.2.1).
+
+        Rows of constraints that are not imposed, their bounds being infinite, are empty and hold.
+
+        Raises:
+            InvalidInputError: A value is not finite; the message names function, place and time.
+        """
+        flat = self._values(reference, parameters)[0]
+        if not np.isfinite(flat).all():
+            absent = self._absent(flat)
+            self._clear(flat, absent)
+            if not np.isfinite(flat).all():
+                raise faults.not_finite(self._stages, reference, parameters)
+            heads = self._heads & absent
+            flat[self._parts["h"]][heads] = 1.0
+        return ConeValues.from_flat(self.pattern, flat)
+
+    def largest_entry(self, vector: Array) -> str:
+        """Which quantity is largest in a reference vector, and at which node."""
+        return faults.describe_entry(self.problem, self.layout, int(np.argmax(np.abs(vector))))
+
+    def require_finite(self, reference: Array, what: str) -> None:
+        """Refuse a reference vector, called ``what``, with entries that are not finite.
+
+        Raises:
+            InvalidInputError: With the first such entry.
+        """
+        wrong = np.flatnonzero(~np.isfinite(reference))
+        if wrong.size:
+            entry = faults.describe_entry(self.problem, self.layout, int(wrong[0]))
+            raise InvalidInputError(f"{entry} of {what}", float(reference[wrong[0]]), "finite")
+
+    def not_convex(self, reference: Array, parameters: Array) -> NotConvexError:
+        """The error that names the cost for which a subproblem is not convex."""
+        return faults.not_convex(self._stages, reference, parameters)
 
     def values_pullback(
         self, reference: Array, parameters: Array, cotangent: ConeValues
     ) -> tuple[Array, Array]:
         """Eq. d3: gradient with respect to (reference, parameters) from that of the values."""
-        pulled = self._pullback(reference, parameters, cotangent.to_flat())
-        return pulled[0], pulled[1]
+        flat = cotangent.to_flat()
+        if not self._bounded:
+            self._clear(flat, self._absent(self._values(reference, parameters)[0]))
+        pulled = self._pullback(reference, parameters, flat)
+        return pulled[0], np.where(np.isinf(parameters), 0.0, pulled[1])
 
     def values_pushforward(
         self, reference: Array, parameters: Array, d_reference: Array, d_parameters: Array
@@ -145,6 +202,8 @@ class Transcription:
         """Change of the values along a direction of (reference, parameters)."""
         direction = np.concatenate([d_reference, d_parameters])
         pushed = self._pushforward(reference, parameters, direction)[0]
+        if not self._bounded:
+            self._clear(pushed, self._absent(self._values(reference, parameters)[0]))
         return ConeValues.from_flat(self.pattern, pushed)
 
     def evaluate(self, reference: Array, parameters: Array) -> Evaluation:
@@ -175,3 +234,33 @@ class Transcription:
         if decided is not None:
             return decided
         return float(parameters[self.table.slice(TERMINAL_TIME)][0])
+
+    def _has_every_bound(self) -> bool:
+        """Whether no parameter can be infinite and no bound is as declared."""
+        if any(parameter.infinite for parameter in self.table.parameters):
+            return False
+        defaults = self.problem.pack()
+        flat = self._values(self.initial_guess(defaults), defaults)[0]
+        return not self._absent(flat).any()
+
+    def _absent(self, flat: Array) -> NDArray[np.bool_]:
+        """(m,) rows of G of constraints that are not imposed: whose h is plus infinity.
+
+        A cone is not when its first row's is.
+        """
+        pattern = self.pattern
+        infinite = flat[self._parts["h"]] == np.inf
+        sizes = np.array(pattern.soc_dims, dtype=np.intp)
+        infinite[pattern.n_nonnegative :] = np.repeat(infinite[pattern.soc_starts], sizes)
+        return np.asarray(infinite)
+
+    def _clear(self, flat: Array, absent: NDArray[np.bool_]) -> None:
+        """Set the values of these rows of G and h to zero, in place."""
+        flat[self._parts["g"]][absent[self.pattern.g.indices]] = 0.0
+        flat[self._parts["h"]][absent] = 0.0
+
+
+def _transcribed(
+    problem: OptimalControlProblem, intervals: int, free_terminal_time: bool
+) -> Transcription:
+    return Transcription(problem, intervals, free_terminal_time=free_terminal_time)

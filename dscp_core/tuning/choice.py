@@ -104,7 +104,7 @@ def cost_is_minus_mass(
         tuned: Indices of those that may change.
     """
     names = [s.name for s in problem.states]
-    if _MASS not in names or problem.running_cost is not None:
+    if _MASS not in names or problem.running_cost is not None or problem.terminal_cost is None:
         return False
     x, time = ca.SX.sym("x", len(names)), ca.SX.sym("t")
     packed = ca.SX.sym("p", problem.table.size)

@@ -181,16 +181,18 @@ def constraint_scales(
     largest = float(force.max()) or 1.0
     force += 1e-10 * largest  # where nothing acts, any multiplier is large
     size = np.abs(values.g)
+    squares = rows.entry_sums(size * size)
     # A constraint without entries can balance nothing: any tiny number keeps it inactive.
-    squares = np.maximum(rows.entry_sums(size * size), np.finfo(np.float64).tiny)
+    empty = squares == 0.0
+    squares[empty] = np.finfo(np.float64).tiny
     slack = rows.entry_sums(size * np.abs(z)[g_columns])
     slack += np.bincount(rows.constraint, np.abs(values.h), minlength=rows.n_constraints)
     # Where h and z are zero the slack has no size of its own.
     floor = 1e-6 * max(1.0, float(slack.max(initial=0.0)))
+    dual = largest / np.sqrt(squares)
+    local = rows.entry_sums(size * force[g_columns]) / squares
     return ConstraintScales(
-        slack=np.maximum(slack, floor),
-        dual=largest / np.sqrt(squares),
-        local_dual=rows.entry_sums(size * force[g_columns]) / squares,
+        slack=np.maximum(slack, floor), dual=dual, local_dual=np.where(empty, dual, local)
     )
 
 

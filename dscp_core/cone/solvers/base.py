@@ -9,6 +9,7 @@ from typing import Protocol
 
 import numpy as np
 
+from dscp_core.cone.convexity import ConvexityCheck
 from dscp_core.cone.program import ConePattern, ConeSolution, ConeValues, FloatArray, SolveStatus
 from dscp_core.cone.residuals import (
     BoundMatrices,
@@ -71,7 +72,8 @@ class ConeSolver(Protocol):
             time_limit_s: Wall time allowed [s]; nothing is tried when it is not positive.
 
         Raises:
-            InvalidInputError: If the data do not fit the pattern or are not finite.
+            InvalidInputError: If the data do not fit the pattern, are not finite, or Q is not
+                positive semidefinite.
         """
         ...
 
@@ -109,10 +111,12 @@ class AnswerChecker:
         self._pattern = pattern
         self._settings = settings
         self._matrices = BoundMatrices(pattern)
+        self._convexity = ConvexityCheck(pattern)
 
     def bind(self, values: ConeValues) -> FloatArray:
         """Take the data of the next solve; returns the values of [A; G] stacked."""
         values.check(self._pattern)
+        self._convexity.check(values)
         self._matrices.bind(values)
         return self._matrices.stacked_values
 

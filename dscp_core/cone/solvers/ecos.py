@@ -16,7 +16,6 @@ import scipy.sparse as sp
 
 from dscp_core.cone.program import ConePattern, ConeSolution, ConeValues, FloatArray, SolveStatus
 from dscp_core.cone.solvers.base import AnswerChecker, RawAnswer, SolverSettings, import_backend
-from dscp_core.errors import InvalidInputError
 
 # Exit flags of ECOS; 10, 11, 12 are the "inaccurate" forms of 0, 1, 2 and count as failures
 # until the residual or certificate check says otherwise.
@@ -60,11 +59,7 @@ class EcosSolver:
         self._g = sp.csc_matrix(pattern.g.matrix(np.ones(pattern.g.nnz)))
 
     def solve(self, values: ConeValues, *, time_limit_s: float | None = None) -> ConeSolution:
-        """See `ConeSolver.solve`.
-
-        Raises:
-            InvalidInputError: Also if Q is not positive semidefinite.
-        """
+        """See `ConeSolver.solve`."""
         if time_limit_s is not None and time_limit_s <= 0.0:
             return self._checker.not_attempted(time_limit_s)
         self._checker.bind(values)
@@ -165,10 +160,6 @@ class _Epigraph:
         self._q.data[self._diagonal] += shift
         self._factor.update(self._q, upper=True)
         lower, pivots, _ = self._factor.factors()
-        if pivots.min() < -1e-9 * largest:
-            raise InvalidInputError(
-                "q", f"smallest pivot {pivots.min():.3e}", "positive semidefinite"
-            )
         roots = np.sqrt(np.maximum(pivots, 0.0))
         unscaled = np.concatenate((np.ones(roots.size), lower.data))
         self._f.data = roots[self._f_rows] * unscaled

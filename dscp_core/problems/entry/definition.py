@@ -16,6 +16,7 @@ from dscp_core.problem.declaration import (
     OptimalControlProblem,
     Parameters,
     PathConstraint,
+    Quadrature,
     StagePoint,
     Variable,
     Where,
@@ -312,8 +313,8 @@ def entry(formulation: Formulation = Formulation.QUADRATIC) -> OptimalControlPro
         dynamics=dynamics,
         initial_state=_initial_state,
         final_state=_FINAL_STATE,
-        terminal_cost=lambda x, time, p: ca.SX(0),
         running_cost=_running_cost,
+        quadrature=Quadrature.SUM,
         # The paper's trust-region weights are in units of the cost.
         cost_scale=1.0,
         cost_magnitude=1e-2,

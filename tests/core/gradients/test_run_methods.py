@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from core.toy_problems import cart, free_cart, least_effort
+from core.toy_problems import cart, effort_of, free_cart, least_effort
 from core.whole_runs import MINUS_FINAL_MASS, descent, difference, packed, unit
 from numpy.typing import NDArray
 
@@ -126,7 +126,7 @@ def test_implicit_matches_differences_of_the_optimum() -> None:
     trace = scp.run(scp.transcription.table.pack())
 
     def cost(time_s: float, mass_kg: float) -> float:
-        return float(time_s / 8 * np.sum(least_effort(8, time_s, mass_kg) ** 2) / 2)
+        return effort_of(least_effort(8, time_s, mass_kg), time_s)
 
     for method in (unrolled, implicit):
         gradient = method(scp, trace, CostLoss())

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import pickle
 import subprocess
 import sys
 from dataclasses import replace
@@ -14,8 +15,7 @@ from dscp_core import problems
 from dscp_core.errors import InvalidInputError
 from dscp_core.gradients.losses import ConvergenceLoss, CostLoss, FinalStateLoss
 from dscp_core.gradients.run import Method, implicit, unrolled
-from dscp_core.gradients.torch_layer import DscpLossLayer, DscpTrajectoryLayer, SeedLoss
-from dscp_core.problem.declaration import CostTerm, Where
+from dscp_core.gradients.torch_layer import DscpLossLayer, DscpTrajectoryLayer, LossBatch, SeedLoss
 from dscp_core.scp.scp import Scp, ScpOptions, ScpStatus
 from dscp_core.transcription.transcription import Transcription
 
@@ -62,8 +62,9 @@ def test_trajectory_passes_gradcheck(scp: Scp) -> None:
 
 def test_free_terminal_time_passes_gradcheck() -> None:
     # The effort alone would stretch the time for ever; a weight on the time balances it.
-    hurry = CostTerm("hurry", lambda at, reference, p: at.step + at.step**2, Where.MEAN)
-    problem = replace(cart(), cost_terms=(*cart().cost_terms, hurry), path_constraints=())
+    problem = replace(
+        cart(), terminal_cost=lambda x, time, p: time + time**2 / 4, path_constraints=()
+    )
     scp = Scp(
         Transcription(problem, 4, free_terminal_time=True), replace(OPTIONS, fixed_iterations=5)
     )
@@ -317,3 +318,25 @@ def test_core_does_not_import_torch() -> None:
         "sys.exit('torch' in sys.modules)"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_layers_can_be_pickled(scp: Scp) -> None:
+    # The cart's functions are lambdas.
+    layers = (
+        DscpLossLayer(scp, ("drag", "target"), CostLoss(), parameters={"mass": 1.2}),
+        DscpTrajectoryLayer(scp, ("drag", "target"), parameters={"mass": 1.2}),
+    )
+    target = torch.tensor([[1.0, 0.1]], dtype=torch.float64)
+    for layer in layers:
+        outputs = []
+        for module in (layer, pickle.loads(pickle.dumps(layer))):
+            drag = column(0.3)
+            batch = module(drag=drag, target=target)
+            output = batch.values if isinstance(batch, LossBatch) else batch.states
+            output.sum().backward()
+            assert drag.grad is not None
+            outputs.append((output.detach().numpy(), drag.grad.numpy()))
+        for given, restored in zip(*outputs, strict=True):
+            # A backend keeps scalings between runs; tolerance 1e-12 of the solver.
+            np.testing.assert_allclose(restored, given, rtol=1e-9, atol=1e-12)
+            assert np.any(given)

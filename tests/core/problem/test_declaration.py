@@ -67,7 +67,7 @@ def test_algorithm_parameters_come_last_and_take_the_declared_defaults() -> None
 
 
 def test_cost_terms_are_quadratic() -> None:
-    quartic = CostTerm("effort", lambda at, reference, p: at.u[0] ** 4)
+    quartic = CostTerm("effort", lambda at, reference, p: (at.u[0] - reference.u[0]) ** 4)
     with pytest.raises(InvalidInputError, match="cost term effort"):
         Transcription(replace(cart(), cost_terms=(quartic,)), 4)
 

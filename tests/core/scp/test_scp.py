@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from core.toy_problems import cart, free_cart, least_effort
+from core.toy_problems import cart, effort_of, free_cart, least_effort
 from numpy.typing import NDArray
 
 from dscp_core import problems
@@ -47,8 +47,7 @@ def test_linear_quadratic_problem_needs_one_step() -> None:
     forces = transcription.layout.controls(result.final_reference)[:, 0]
     # The solver's tolerance of 1e-10 on forces of size 1.
     np.testing.assert_allclose(forces, least_effort(8, 2.0, 1.5), rtol=0.0, atol=1e-8)
-    # Cost of eq. 1 as declared: T times the sum over the nodes.
-    assert result.iterations[-1].cost == pytest.approx(0.25 * np.sum(forces**2) / 2, rel=1e-12)
+    assert result.iterations[-1].cost == pytest.approx(effort_of(forces, 2.0), rel=1e-12)
 
 
 def test_converges(scp: Scp, nominal: ScpResult) -> None:
@@ -149,7 +148,7 @@ def test_subproblem_infeasible() -> None:
 def test_unbounded_subproblem_is_a_failure() -> None:
     problem = replace(
         cart(),
-        cost_terms=(),
+        running_cost=None,
         path_constraints=(),
         terminal_cost=lambda x, time, p: -x[0],
         final_state={"speed": lambda p: p["target"][1]},

@@ -255,11 +255,11 @@ def test_layout_is_a_bijection(case: Case) -> None:
 def test_mean_and_node_terms_meet_where_they_share_entries() -> None:
     # Every sum of squares below contributes to the same entries of Q: duplicates must add up.
     terms = (
-        CostTerm("node", lambda at, reference, p: at.u[0] ** 2, Where.NODE),
-        CostTerm("again", lambda at, reference, p: 2 * at.u[0] ** 2, Where.NODE),
-        CostTerm("mean", lambda at, reference, p: 4 * at.u[0] ** 2, Where.MEAN),
+        CostTerm("node", lambda at, ref, p: (at.u[0] - ref.u[0]) ** 2, Where.NODE),
+        CostTerm("again", lambda at, ref, p: 2 * (at.u[0] - ref.u[0]) ** 2, Where.NODE),
+        CostTerm("mean", lambda at, ref, p: 4 * (at.u[0] - ref.u[0]) ** 2, Where.MEAN),
     )
-    problem = replace(cart(), cost_terms=terms)
+    problem = replace(cart(), running_cost=None, cost_terms=terms)
     transcription = Transcription(problem, 3)
     parameters = problem.table.pack()
     values = transcription.values(transcription.initial_guess(parameters), parameters)

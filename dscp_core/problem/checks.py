@@ -1,0 +1,90 @@
+"""Checks of what stands in a declaration: types, names, sizes, numbers."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+from dscp_core.errors import InvalidInputError
+
+
+def members(field: str, values: Any, kind: type) -> tuple[Any, ...]:
+    """The values as a tuple.
+
+    Raises:
+        InvalidInputError: No sequence, or a member of another type.
+    """
+    if not isinstance(values, tuple | list):
+        raise InvalidInputError(field, values, f"a tuple of {kind.__name__}")
+    for index, value in enumerate(values):
+        if not isinstance(value, kind):
+            raise InvalidInputError(f"{field}[{index}]", value, f"a {kind.__name__}")
+    return tuple(values)
+
+
+def distinct(field: str, names: Iterable[str], reserved: Sequence[str] = ()) -> None:
+    """Refuse names that are empty, given twice, or reserved.
+
+    Raises:
+        InvalidInputError: With the first such name.
+    """
+    seen: set[str] = set()
+    for name in names:
+        if not isinstance(name, str) or not name:
+            raise InvalidInputError(f"name in {field}", name, "a name")
+        if name in seen:
+            raise InvalidInputError(field, name, "each name once")
+        if name in reserved:
+            raise InvalidInputError(field, name, "a name that is not reserved")
+        seen.add(name)
+
+
+def positive(field: str, value: Any) -> None:
+    """Refuse what is no finite number above zero.
+
+    Raises:
+        InvalidInputError: With the value.
+    """
+    if not (_is_number(value) and value > 0.0):
+        raise InvalidInputError(field, value, "> 0 and finite")
+
+
+def not_negative(field: str, value: Any) -> None:
+    """Refuse what is no finite number from zero.
+
+    Raises:
+        InvalidInputError: With the value.
+    """
+    if not (_is_number(value) and value >= 0.0):
+        raise InvalidInputError(field, value, ">= 0 and finite")
+
+
+def numbers(field: str, values: Any, size: int) -> tuple[float, ...]:
+    """The values as a tuple of this size, or an empty one, of finite numbers from zero.
+
+    Raises:
+        InvalidInputError: Another size, or a value that is none of these.
+    """
+    if not isinstance(values, tuple | list) or len(values) not in (0, size):
+        raise InvalidInputError(field, values, f"length {size}")
+    for index, value in enumerate(values):
+        not_negative(f"{field}[{index}]", value)
+    return tuple(values)
+
+
+def function(field: str, value: Any) -> None:
+    """Refuse what cannot be called.
+
+    Raises:
+        InvalidInputError: With the value.
+    """
+    if not callable(value):
+        raise InvalidInputError(field, value, "a function")
+
+
+def _is_number(value: Any) -> bool:
+    try:
+        return not isinstance(value, str | bool) and math.isfinite(value)
+    except TypeError:
+        return False

@@ -1,0 +1,177 @@
+"""What a declaration is made of: variables, constraints, costs, misses, a guess."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from enum import Enum
+from typing import Any
+
+import casadi as ca
+
+from dscp_core.problem import checks
+
+
+@dataclass(frozen=True)
+class Variable:
+    """A state or control component.
+
+    Attributes:
+        name: Unique name.
+        unit: SI unit.
+        scale: SI value of one scaled unit; the subproblems are solved in scaled units.
+        description: What it is.
+    """
+
+    name: str
+    unit: str
+    scale: float
+    description: str
+
+    def __post_init__(self) -> None:
+        checks.positive(f"scale of {self.name}", self.scale)
+
+
+class Where(Enum):
+    """Where along the trajectory an expression is imposed."""
+
+    NODE = "node"
+    MEAN = "interval mean"
+
+
+class Quadrature(Enum):
+    """Weights of the nodes in the running cost, times the interval length T.
+
+    TRAPEZOID: 1, and 1/2 at both ends; the error of the cost falls with the square of T. SUM: 1
+    everywhere, as the paper sums; the error falls with T.
+    """
+
+    TRAPEZOID = "trapezoid"
+    SUM = "sum"
+
+
+@dataclass(frozen=True)
+class StagePoint:
+    """Symbols at one node or interval mean; all are CasADi SX in SI units.
+
+    Attributes:
+        x: State, (nx, 1).
+        u: Control, (nu, 1).
+        step: Interval length T in seconds.
+    """
+
+    x: ca.SX
+    u: ca.SX
+    step: ca.SX
+
+
+Parameters = Mapping[str, ca.SX]
+
+
+@dataclass(frozen=True)
+class Constraint:
+    """What path and cone constraints have in common.
+
+    Attributes:
+        name: Name in reports.
+        expression: Of a point and the parameters, SI; what it returns is the subclass's matter.
+        scale: SI magnitude by which the rows are divided.
+        unit: Unit of the expression.
+        where: Node or interval mean.
+        skip_first: Leave out the first node or interval (its state is pinned).
+        skip_last: Leave out the last node or interval.
+        tolerance: Violation of the flown trajectory that a certificate accepts, in ``unit``; a
+            function of the parameters' values where it grows with the vehicle.
+    """
+
+    name: str
+    expression: Callable[[StagePoint, Parameters], ca.SX]
+    scale: float
+    unit: str
+    where: Where = Where.NODE
+    skip_first: bool = False
+    skip_last: bool = False
+    tolerance: float | Callable[[Mapping[str, Any]], float] = 0.0
+
+    def __post_init__(self) -> None:
+        checks.positive(f"scale of constraint {self.name}", self.scale)
+        checks.function(f"constraint {self.name}", self.expression)
+        if not callable(self.tolerance):
+            checks.not_negative(f"tolerance of constraint {self.name}", self.tolerance)
+
+    def accepted(self, values: Mapping[str, Any]) -> float:
+        """The tolerance for a vehicle's values by name."""
+        return self.tolerance(values) if callable(self.tolerance) else self.tolerance
+
+
+class PathConstraint(Constraint):
+    """``g(x, u, p) <= 0`` with the scalar g as the expression, linearised (eq. 7).
+
+    It is not imposed where g is minus infinity: at an infinite bound.
+    """
+
+
+class ConeConstraint(Constraint):
+    """``|g1(x, u, p)|_2 <= g0(x, u, p)``, affine in (x, u); the expression is [g0; g1].
+
+    It is not imposed where g0 is infinite.
+    """
+
+
+@dataclass(frozen=True)
+class Miss:
+    """A distance from the target at the end of the flown trajectory.
+
+    Attributes:
+        name: Name in reports.
+        expression: ``(x(t_f), p)`` to a nonnegative scalar, SI.
+        unit: Its unit.
+        tolerance: Largest value that a certificate accepts.
+    """
+
+    name: str
+    expression: Callable[[ca.SX, Parameters], ca.SX]
+    unit: str
+    tolerance: float
+
+    def __post_init__(self) -> None:
+        checks.function(f"miss {self.name}", self.expression)
+        checks.not_negative(f"tolerance of miss {self.name}", self.tolerance)
+
+
+@dataclass(frozen=True)
+class CostTerm:
+    """A cost of the subproblem, summed over nodes or interval means.
+
+    Terms whose gradient at the reference is not zero have to be a model of the running cost: their
+    gradients there sum up to that of T times the running cost. At nodes they get the weights of
+    the problem's quadrature. At interval means they sum the running cost by the midpoint rule,
+    which does not see controls that alternate from node to node; 1e-4 of their curvature on the
+    controls' change from node to node is added to what a subproblem minimises, so that it does.
+
+    Attributes:
+        name: Name in reports.
+        expression: Returns a scalar, at most quadratic and convex in the decision; arguments are
+            the decision's point, the reference's point and the parameters. Units of the cost.
+        where: Node or interval mean.
+    """
+
+    name: str
+    expression: Callable[[StagePoint, StagePoint, Parameters], ca.SX]
+    where: Where = Where.MEAN
+
+    def __post_init__(self) -> None:
+        checks.function(f"cost term {self.name}", self.expression)
+
+
+@dataclass(frozen=True)
+class InitialGuess:
+    """Reference trajectory of the first iteration, as CasADi expressions of the parameters.
+
+    Attributes:
+        states: (nx, N+1), SI.
+        controls: (nu, N+1), SI.
+    """
+
+    states: ca.MX
+    controls: ca.MX

@@ -1,0 +1,83 @@
+"""Which matrices of a cost pass as convex, against their eigenvalues."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dscp_core.cone.convexity import (
+    ConvexityCheck,
+    NotConvexError,
+    least_eigenvalue,
+    require_convex,
+)
+from dscp_core.cone.program import ConeProgram
+from dscp_core.cone.solvers import SOLVER_NAMES, make_solver
+
+BOX = {"G": np.vstack([np.eye(2), -np.eye(2)]), "h": np.ones(4)}
+
+
+@pytest.mark.parametrize("solver", SOLVER_NAMES)
+@pytest.mark.parametrize("matrix", [np.diag([1.0, -1.0]), np.array([[1.0, 2.0], [2.0, 1.0]])])
+def test_a_saddle_is_no_solution(solver, matrix):
+    program = ConeProgram.from_matrices(matrix, [0.0, 0.0], **BOX)
+    with pytest.raises(NotConvexError, match=r"Q: got 'least eigenvalue -1', .*semidefinite"):
+        make_solver(solver, program.pattern).solve(program.values)
+
+
+def test_a_zero_diagonal_with_products_is_no_convex_cost():
+    matrix = sp.csc_array(np.array([[0.0, 1e-3], [1e-3, 0.0]]))
+    matrix.setdiag(0.0)
+    program = ConeProgram.from_matrices(matrix, [0.0, 0.0], **BOX)
+    with pytest.raises(NotConvexError, match=r"least eigenvalue -0\.001"):
+        make_solver("clarabel", program.pattern).solve(program.values)
+
+
+@settings(max_examples=200, deadline=None)
+@given(
+    size=st.integers(1, 8),
+    seed=st.integers(0, 2**32 - 1),
+    spread=st.floats(0.0, 3.0),
+    sign=st.sampled_from([-1.0, 0.0, 1.0]),
+    margin=st.floats(-5.0, -1.0),
+)
+def test_verdict_is_that_of_the_eigenvalues(size, seed, spread, sign, margin):
+    random = np.random.default_rng(seed)
+    basis = np.linalg.qr(random.standard_normal((size, size)))[0]
+    eigenvalues = random.uniform(0.1, 1.0, size)
+    eigenvalues[0] = sign * 10.0**margin
+    scales = 10.0 ** random.uniform(-spread / 2, spread / 2, size)
+    matrix = scales[:, None] * (basis * eigenvalues @ basis.T) * scales
+    matrix = (matrix + matrix.T) / 2
+    program = ConeProgram.from_matrices(matrix, np.zeros(size))
+    if sign < 0.0:
+        with pytest.raises(NotConvexError):
+            ConvexityCheck(program.pattern).check(program.values)
+    else:
+        ConvexityCheck(program.pattern).check(program.values)
+
+
+def test_rounding_is_no_saddle():
+    # Projections across a direction, which are singular, at very different sizes.
+    random = np.random.default_rng(0)
+    blocks = []
+    for exponent in range(-6, 7):
+        direction = random.standard_normal(3)
+        direction[exponent % 3] = 0.0
+        direction /= np.linalg.norm(direction)
+        blocks.append(10.0**exponent * (np.eye(3) - np.outer(direction, direction)))
+    program = ConeProgram.from_matrices(sp.block_diag(blocks), np.zeros(39))
+    ConvexityCheck(program.pattern).check(program.values)
+    for block in blocks:
+        require_convex("projection", block)
+
+
+def test_least_eigenvalue_counts_empty_rows():
+    assert least_eigenvalue(np.diag([2.0, 0.0])) == 0.0
+    assert least_eigenvalue(np.diag([2.0, 3.0])) == 2.0
+    assert least_eigenvalue(np.zeros((3, 3))) == 0.0
+    with pytest.raises(NotConvexError, match=r"cost term effort: .*-3 of its Hessian.*convex"):
+        require_convex("cost term effort", np.diag([1.0, -3.0]))
