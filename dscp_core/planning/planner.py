@@ -7,7 +7,7 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import casadi as ca
 import numpy as np
@@ -25,6 +25,7 @@ from dscp_core.planning.remainder import Remainder
 from dscp_core.planning.settings import PlannerSettings, TerminalTimePredictor
 from dscp_core.problem.declaration import TERMINAL_TIME, OptimalControlProblem, named
 from dscp_core.problem.parameters import Value
+from dscp_core.problem.tracing import Tracer
 from dscp_core.scp.scp import Scp, ScpStatus
 from dscp_core.transcription.transcription import Transcription
 
@@ -105,8 +106,17 @@ class Planner:
         self._time = self.problem.table.slice(TERMINAL_TIME)
         self._time_bounds = self._bounds_of_time()
         packed = ca.SX.sym("p", self.problem.table.size)
-        start = self.problem.initial_state(named(self.problem, packed))
+        start = Tracer(self.problem.table, packed)(
+            "initial_state",
+            self.problem.initial_state,
+            named(self.problem, packed),
+            rows=len(self.problem.states),
+        )
         self._start = ca.Function("initial_state", [packed], [start])
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """By what it was made of; the copy compiles its own functions."""
+        return Planner, (self.problem, self.settings, self._predictor)
 
     def _loop(self, *, free: bool) -> Scp:
         transcription = Transcription(

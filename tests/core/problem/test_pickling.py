@@ -18,6 +18,7 @@ import pytest
 from core.toy_problems import Costs, cart
 
 from dscp_core import problems
+from dscp_core.planning.planner import Planner
 from dscp_core.problem.declaration import OptimalControlProblem, PathConstraint
 from dscp_core.scp.scp import Scp, ScpOptions
 from dscp_core.transcription.transcription import Transcription
@@ -156,3 +157,13 @@ def test_copies() -> None:
     for duplicate in (copy.copy(problem), copy.deepcopy(problem)):
         assert duplicate.name == problem.name
         assert costs(duplicate) == costs(problem)
+
+
+def test_planners() -> None:
+    planner = Planner(symbolic(), parameters={"drag": 0.3})
+    restored = pickle.loads(pickle.dumps(planner))
+    state = planner.initial_state
+    plans = [p.plan(state) for p in (planner, restored)]
+    assert all(outcome.plan is not None for outcome in plans)
+    assert plans[1].cost == pytest.approx(plans[0].cost, rel=1e-9)
+    assert restored.settings == planner.settings
