@@ -5,6 +5,7 @@ from core.random_programs import EVERY_BLOCK, plant
 
 from dscp_core.cone.program import ConePattern, ConeProgram, ConeValues, CscPattern
 from dscp_core.cone.residuals import BoundMatrices, cone_violation, residuals
+from dscp_core.cone.solvers import make_solver
 from dscp_core.errors import InvalidInputError
 
 Q = np.array([[2.0, 0.5, 0.0], [0.5, 1.0, 0.0], [0.0, 0.0, 0.0]])
@@ -101,6 +102,35 @@ def test_wrong_programs_are_refused_by_field(changes, field):
     with pytest.raises(InvalidInputError) as caught:
         program(**changes)
     assert caught.value.field == field
+
+
+@pytest.mark.parametrize("solver", ["clarabel", "qoco"])
+@pytest.mark.parametrize(
+    ("parts", "expected"),
+    [
+        ({}, [-1.0, 1.0]),
+        ({"A": None, "b": None, "G": None, "h": None}, [-1.0, 1.0]),
+        ({"A": [[1.0, 1.0]], "b": [1.0]}, [-0.5, 1.5]),
+        ({"A": None, "b": None, "G": [[0.0, 1.0]], "h": [0.5]}, [-1.0, 0.5]),
+        (
+            {"G": [[0.0, 0.0], [-1.0, 0.0], [0.0, -1.0]], "h": [1.0, 0.0, 0.0], "soc_dims": [3]},
+            [-(0.5**0.5), 0.5**0.5],
+        ),
+    ],
+)
+def test_absent_parts_are_none(solver, parts, expected):
+    program = ConeProgram.from_matrices(np.eye(2), [1.0, -1.0], **parts)
+    solution = make_solver(solver, program.pattern).solve(program.values)
+    np.testing.assert_allclose(solution.z, expected, atol=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("parts", "message"),
+    [({"b": [1.0]}, r"b.shape: got \(1,\)"), ({"G": [[1.0, 0.0]]}, r"h.shape: got \(0,\)")],
+)
+def test_half_a_part_is_refused(parts, message):
+    with pytest.raises(InvalidInputError, match=message):
+        ConeProgram.from_matrices(np.eye(2), [1.0, -1.0], **parts)
 
 
 def test_off_diagonal_without_diagonal_is_refused():

@@ -160,14 +160,6 @@ def test_clarabel_stops_at_its_time_limit_and_forgets_it():
     assert solver.solve(program.values).status is SolveStatus.SOLVED
 
 
-def test_an_indefinite_q_is_refused_by_ecos():
-    program = ConeProgram.from_matrices(
-        np.array([[1.0, 2.0], [2.0, 1.0]]), np.ones(2), None, [], np.eye(2), [1.0, 1.0], 2
-    )
-    with pytest.raises(InvalidInputError, match="positive semidefinite"):
-        solve("ecos", program)
-
-
 def test_chain_asks_the_next_solver_only_after_a_failure():
     program = plant(0).program
     answer = solve("clarabel,qoco", program)
