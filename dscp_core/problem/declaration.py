@@ -35,6 +35,7 @@ from dscp_core.problem.elements import (
 )
 from dscp_core.problem.extras import Extras
 from dscp_core.problem.parameters import Parameter, ParameterTable, Value, load_parameter_file
+from dscp_core.problem.tracing import called
 
 Symbol = TypeVar("Symbol", ca.SX, ca.MX)
 
@@ -268,7 +269,10 @@ class OptimalControlProblem:
         """
         packed = self.table.pack(values)
         if self.check_parameters is not None:
-            self.check_parameters(self.table.unpack(packed))
+            expected = "a function of the parameters' values"
+            named_values = self.table.unpack(packed)
+            check = self.check_parameters
+            called("check_parameters", self.table, check, named_values, expected=expected)
         return packed
 
     def read_vehicle(self, path: str | Path) -> dict[str, Value]:

@@ -83,7 +83,13 @@ class Tracer:
                 raise InvalidInputError(what, "a NaN constant", bound)
 
 
-def called(what: str, table: ParameterTable, function: Callable[..., Any], *arguments: Any) -> Any:
+def called(
+    what: str,
+    table: ParameterTable,
+    function: Callable[..., Any],
+    *arguments: Any,
+    expected: str = "a function of CasADi symbols",
+) -> Any:
     """Result of a function of a declaration.
 
     Raises:
@@ -94,17 +100,19 @@ def called(what: str, table: ParameterTable, function: Callable[..., Any], *argu
     except InvalidInputError:
         raise
     except Exception as error:
-        raise _refusal(what, table, error) from error
+        raise _refusal(what, table, error, expected) from error
 
 
-def _refusal(what: str, table: ParameterTable, error: Exception) -> InvalidInputError:
+def _refusal(
+    what: str, table: ParameterTable, error: Exception, expected: str
+) -> InvalidInputError:
     place = _place(error)
     if isinstance(error, KeyError) and error.args and error.args[0] not in table.names:
         name = error.args[0]
         known = ", ".join(table.names)
         return InvalidInputError(what, f"parameter {name!r}{place}", f"one of {known}")
     message = " ".join(f"{type(error).__name__}: {error}".split())[:_LONGEST_MESSAGE]
-    return InvalidInputError(what, message + place, "a function of CasADi symbols")
+    return InvalidInputError(what, message + place, expected)
 
 
 def _place(error: Exception) -> str:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from dscp_core.errors import DscpError, InvalidInputError
 from dscp_core.planning.plan import Plan, PlanOutcome, PlanStatus
 from dscp_core.planning.planner import Planner, PlannerSettings, TerminalTimePredictor
 from dscp_core.problem.declaration import OptimalControlProblem
@@ -32,15 +31,9 @@ class PlannerSetup:
         """Compile the problem.
 
         Raises:
-            InvalidInputError: A setting is refused, or a function of the problem fails.
+            InvalidInputError: A setting is refused.
         """
-        try:
-            return Planner(self.problem, self.settings, self.predictor)
-        except DscpError:
-            raise
-        except Exception as error:  # a problem's functions are anybody's code
-            bound = f"one that can be compiled: {type(error).__name__}: {error}"
-            raise InvalidInputError("problem", self.problem.name, bound) from error
+        return Planner(self.problem, self.settings, self.predictor)
 
     def plans_like(self, other: PlannerSetup) -> bool:
         """Whether another one makes the same plans."""

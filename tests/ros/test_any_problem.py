@@ -268,7 +268,9 @@ def refused(ros, folder: Path, *arguments: str) -> str:
         ("hocky", ("hocky", "one of powered_descent, entry", "FILE.py:NAME")),
         ("stateless.py:problem", ("states",)),
         ("fixed.py:problem", ("initial_state_parameters of puck", "4 states")),
-        ("raising.py:problem", ("puck", "wind")),
+        ("raising.py:problem", ("dynamics", "wind", "raising.py:4")),
+        ("careless.py:problem", ("check_parameters", "ZeroDivisionError", "careless.py:4")),
+        ("costless.py:problem", ("cost",)),
     ],
 )
 def test_what_is_no_problem_is_refused_at_the_start(ros, tmp_path, text, words):
@@ -281,6 +283,10 @@ def test_what_is_no_problem_is_refused_at_the_start(ros, tmp_path, text, words):
     (tmp_path / "stateless.py").write_text(sys_path + changed.format("states=()"))
     without = changed.format("initial_state_parameters=()")
     (tmp_path / "fixed.py").write_text(sys_path + without)
+    careless = changed.format("check_parameters=lambda values: 1 / 0")
+    (tmp_path / "careless.py").write_text(sys_path + careless)
+    costless = changed.format("running_cost=None, cost_terms=(), terminal_cost=None")
+    (tmp_path / "costless.py").write_text(sys_path + costless)
     raising = changed.format("dynamics=lambda x, u, p: p['wind']")
     (tmp_path / "raising.py").write_text(sys_path + raising)
     line = refused(ros, tmp_path, "--ros-args", "-p", f"problem:={text}")
