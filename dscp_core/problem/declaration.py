@@ -129,6 +129,29 @@ class OptimalControlProblem:
         control_states: Index of the state that each control acts on (for named-vector messages).
         formulation: Which of several forms of the problem this is; empty where there is one.
         extras: What it brings along, such as a figure of its own.
+
+    Example:
+        >>> import casadi as ca
+        >>> from dscp_core import InitialGuess, OptimalControlProblem, Parameter, Planner, Variable
+        >>> problem = OptimalControlProblem(
+        ...     name="cart",
+        ...     states=(Variable("place", "m", 1.0, ""), Variable("speed", "m/s", 1.0, "")),
+        ...     controls=(Variable("force", "N/kg", 1.0, "Per mass."),),
+        ...     parameters=(
+        ...         Parameter("terminal_time", 2.0, "s", "Duration."),
+        ...         Parameter("start", (0.0, 0.0), "1", "State at the start."),
+        ...     ),
+        ...     dynamics=lambda x, u, p: ca.vertcat(x[1], u[0]),
+        ...     initial_state=lambda p: p["start"],
+        ...     initial_state_parameters=("start",),
+        ...     final_state={"place": lambda p: 1.0, "speed": lambda p: 0.0},
+        ...     terminal_cost=lambda x, time, p: 0.0 * time,
+        ...     running_cost=lambda x, u, p: u[0] ** 2,
+        ...     cost_scale=1.0,
+        ...     initial_guess=lambda p, n: InitialGuess(ca.MX(2, n + 1), ca.MX(1, n + 1)),
+        ... )
+        >>> Planner(problem).plan().converged
+        True
     """
 
     name: str

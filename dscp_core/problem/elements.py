@@ -21,6 +21,11 @@ class Variable:
         unit: SI unit.
         scale: SI value of one scaled unit; the subproblems are solved in scaled units.
         description: What it is.
+
+    Example:
+        >>> from dscp_core import Variable
+        >>> Variable("height", "m", scale=100.0, description="Above the pad.").unit
+        'm'
     """
 
     name: str
@@ -33,7 +38,13 @@ class Variable:
 
 
 class Where(Enum):
-    """Where along the trajectory an expression is imposed."""
+    """Where along the trajectory an expression is imposed.
+
+    Example:
+        >>> from dscp_core import Where
+        >>> [where.value for where in Where]
+        ['node', 'interval mean']
+    """
 
     NODE = "node"
     MEAN = "interval mean"
@@ -58,6 +69,13 @@ class StagePoint:
         x: State, (nx, 1).
         u: Control, (nu, 1).
         step: Interval length T in seconds.
+
+    Example:
+        >>> import casadi as ca
+        >>> from dscp_core import StagePoint
+        >>> at = StagePoint(x=ca.SX.sym("x", 2), u=ca.SX.sym("u"), step=ca.SX.sym("T"))
+        >>> at.x[1] + at.step * at.u
+        SX((x_1+(T*u)))
     """
 
     x: ca.SX
@@ -108,6 +126,12 @@ class PathConstraint(Constraint):
     """``g(x, u, p) <= 0`` with the scalar g as the expression, linearised (eq. 7).
 
     It is not imposed where g is minus infinity: at an infinite bound.
+
+    Example:
+        >>> from dscp_core import PathConstraint
+        >>> limit = PathConstraint("force_max", lambda at, p: at.u[0] - p["force_max"], 10.0, "N")
+        >>> limit.where.value
+        'node'
     """
 
 
@@ -115,6 +139,13 @@ class ConeConstraint(Constraint):
     """``|g1(x, u, p)|_2 <= g0(x, u, p)``, affine in (x, u); the expression is [g0; g1].
 
     It is not imposed where g0 is infinite.
+
+    Example:
+        >>> import casadi as ca
+        >>> from dscp_core import ConeConstraint
+        >>> thrust = lambda at, p: ca.vertcat(p["thrust_max"], at.u)  # |u| <= thrust_max
+        >>> ConeConstraint("thrust_max", thrust, scale=1e5, unit="N").name
+        'thrust_max'
     """
 
 
@@ -127,6 +158,13 @@ class Miss:
         expression: ``(x(t_f), p)`` to a nonnegative scalar, SI.
         unit: Its unit.
         tolerance: Largest value that a certificate accepts.
+
+    Example:
+        >>> import casadi as ca
+        >>> from dscp_core import Miss
+        >>> miss = Miss("miss_position", lambda x, p: ca.norm_2(x[:3] - p["target"]), "m", 1.0)
+        >>> miss.tolerance
+        1.0
     """
 
     name: str
@@ -154,6 +192,12 @@ class CostTerm:
         expression: Returns a scalar, at most quadratic and convex in the decision; arguments are
             the decision's point, the reference's point and the parameters. Units of the cost.
         where: Node or interval mean.
+
+    Example:
+        >>> import casadi as ca
+        >>> from dscp_core import CostTerm, Where
+        >>> CostTerm("effort", lambda at, ref, p: ref.step * ca.sumsqr(at.u), Where.NODE).name
+        'effort'
     """
 
     name: str
@@ -171,6 +215,13 @@ class InitialGuess:
     Attributes:
         states: (nx, N+1), SI.
         controls: (nu, N+1), SI.
+
+    Example:
+        >>> import casadi as ca
+        >>> from dscp_core import InitialGuess
+        >>> line = ca.MX(ca.DM([[0.0, 0.5, 1.0]]))
+        >>> InitialGuess(states=line, controls=0.0 * line).states.shape
+        (1, 3)
     """
 
     states: ca.MX

@@ -52,6 +52,14 @@ class Extras:
         network: File of the terminal-time network of the default vehicle.
         messages: How states and plans are told of in messages.
         scene: Its plans in space; None for none.
+
+    Example:
+        >>> from dscp_core import problems
+        >>> problems.get("powered_descent").extras.figure is None  # it brings its own
+        False
+        >>> from dscp_core import Extras
+        >>> Extras().figure is None
+        True
     """
 
     figure: PlanFigure | None = None

@@ -32,6 +32,11 @@ class Parameter:
         fixes_optimum: Whether the optimum from a state depends on it; not so for a bound on a
             guess, or a setting of the method.
         infinite: Whether values may be infinite: for a bound, which is then none.
+
+    Example:
+        >>> from dscp_core import Parameter
+        >>> Parameter("mass", 2.0, "kg", "Of the vehicle.", lower=0.1).validate(3)
+        array([3.])
     """
 
     name: str

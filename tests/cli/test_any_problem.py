@@ -32,8 +32,6 @@ from dscp_core import (
     Parameter,
     PathConstraint,
     Variable,
-    CostTerm,
-    Where,
 )
 
 
@@ -88,13 +86,6 @@ def boat(wind_default=0.02, name="boat"):
         },
         terminal_cost=lambda x, t, p: 0.0 * t,
         running_cost=lambda x, u, p: u[0] ** 2 + u[1] ** 2,
-        cost_terms=(
-            CostTerm(
-                "effort",
-                lambda at, ref, p: at.step * 0.0 + ref.step * (at.u[0] ** 2 + at.u[1] ** 2),
-                Where.NODE,
-            ),
-        ),
         cost_scale=1.0,
         cost_unit="m^2/s^3",
         path_constraints=(*limits, PathConstraint("island", clearance, RADIUS, "m", tolerance=0.2)),
@@ -295,4 +286,31 @@ def test_bad_problems_are_refused_in_words(
     code, refused = run(capsys, command[0], f"{folder}/{name}", *command[1:])
     assert code == ExitCode.BAD_INPUT
     assert refused["error"]["field"] == "problem"
+    assert said in refused["error"]["message"]
+
+
+CHANGED = """
+from dataclasses import replace
+from boat import BOAT
+from dscp_core import Variable
+BAD = {change}
+"""
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ("replace(BOAT, dynamics=lambda x, u, p: p['dragg'])", "dragg"),
+        ("replace(BOAT, dynamics=lambda x, u, p: 1 / 0)", "ZeroDivisionError"),
+        ("replace(BOAT, dynamics=lambda x, u, p: x[:2])", "shape"),
+        ("replace(BOAT, states=(), final_state={}, initial_state_parameters=())", "states"),
+        ("replace(BOAT, initial_guess=lambda p, n: None)", "initial_guess"),
+    ],
+)
+def test_declarations_that_are_wrong_are_refused_in_words(
+    folder: Path, change: str, said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (folder / "changed.py").write_text(CHANGED.format(change=change), encoding="utf-8")
+    code, refused = run(capsys, "plan", f"{folder}/changed.py:BAD")
+    assert code == ExitCode.BAD_INPUT
     assert said in refused["error"]["message"]
