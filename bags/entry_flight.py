@@ -12,9 +12,10 @@ import scipy.integrate
 from numpy.typing import NDArray
 
 from dscp_core import problems
-from dscp_core.planning.plan import Plan, PlanOutcome, PlanStatus
+from dscp_core.planning.plan import PlanOutcome, PlanStatus
 from dscp_core.planning.planner import Planner
 from dscp_core.problem.declaration import OptimalControlProblem, named
+from dscp_core.problem.trajectory import Plan
 from dscp_core.transcription.compiled import CompiledFunction
 from dscp_ros.planner.declaration import VEHICLE_PREFIX
 from dscp_ros.planner.parameters import node_settings, parameter_table

@@ -12,8 +12,9 @@ from benchmarks.report import Cell, Report, Table
 from benchmarks.timing import clocked, median_ms, p99_ms
 from dscp_core import problems
 from dscp_core.planning.certificate import PlanVerifier
-from dscp_core.planning.plan import Plan, PlanStatus
+from dscp_core.planning.plan import PlanStatus
 from dscp_core.planning.planner import Planner, PlannerSettings, TerminalTime
+from dscp_core.problem.trajectory import Plan
 from dscp_core.problems.powered_descent.simulation import DescentRecord, simulate_descent
 from dscp_core.scp.scp import ScpOptions
 

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from dscp_core.gradients.plan_layer import PlanLayer
     from dscp_core.gradients.run import DifferentiationError
     from dscp_core.gradients.torch_layer import DscpLossLayer, DscpTrajectoryLayer
-    from dscp_core.planning.plan import Plan, PlanOutcome, PlanStatus, TerminalTime
+    from dscp_core.planning.plan import PlanOutcome, PlanStatus, TerminalTime
     from dscp_core.planning.planner import Planner
     from dscp_core.planning.settings import PlannerSettings
     from dscp_core.problem.declaration import (
@@ -43,6 +43,7 @@ if TYPE_CHECKING:
     )
     from dscp_core.problem.extras import Extras
     from dscp_core.problem.parameters import Parameter
+    from dscp_core.problem.trajectory import Plan
     from dscp_core.problems.loading import ProblemFamily
     from dscp_core.scp.scp import ScpOptions
 
@@ -53,7 +54,7 @@ _HOMES = {
     "gradients.plan_layer": ("PlanLayer",),
     "gradients.run": ("DifferentiationError",),
     "gradients.torch_layer": ("DscpLossLayer", "DscpTrajectoryLayer"),
-    "planning.plan": ("Plan", "PlanOutcome", "PlanStatus", "TerminalTime"),
+    "planning.plan": ("PlanOutcome", "PlanStatus", "TerminalTime"),
     "planning.planner": ("Planner",),
     "planning.settings": ("PlannerSettings",),
     "problem.declaration": (
@@ -69,6 +70,7 @@ _HOMES = {
     ),
     "problem.extras": ("Extras",),
     "problem.parameters": ("Parameter",),
+    "problem.trajectory": ("Plan",),
     "problems.loading": ("ProblemFamily",),
     "scp.scp": ("ScpOptions",),
 }

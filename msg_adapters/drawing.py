@@ -33,7 +33,7 @@ from msg_adapters.path import path_message
 from msg_adapters.stamps import stamp_from_nanoseconds
 
 if TYPE_CHECKING:
-    from dscp_core.planning.plan import Plan
+    from dscp_core.problem.trajectory import Plan
 
 
 @dataclass(frozen=True)

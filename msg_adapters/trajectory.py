@@ -32,7 +32,7 @@ from msg_adapters.stamps import (
 )
 
 if TYPE_CHECKING:
-    from dscp_core.planning.plan import Plan
+    from dscp_core.problem.trajectory import Plan
 
 
 class TrajectoryEncoder:
@@ -150,7 +150,7 @@ def plan_from_trajectory(
         RejectedInputError: NOT_FINITE, EMPTY_FRAME, WRONG_FRAME, DUPLICATE_NAME, UNKNOWN_NAME,
             MISSING_NAME, WRONG_ARRAY_LENGTH, TIME_NOT_INCREASING or INVALID_STAMP, in this order.
     """
-    from dscp_core.planning.plan import Plan
+    from dscp_core.problem.trajectory import Plan
 
     for k, point in enumerate(message.points):
         for field in ("positions", "velocities", "effort"):

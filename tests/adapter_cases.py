@@ -6,7 +6,7 @@ import numpy as np
 from nav_msgs.msg import Path
 
 from dscp_core import problems
-from dscp_core.planning.plan import Plan
+from dscp_core.problem.trajectory import Plan
 from dscp_core.problems.powered_descent.messages import LANDING_FRAME
 from msg_adapters.frames import Array, rotate
 from msg_adapters.layout import StateLayout, problem_layout

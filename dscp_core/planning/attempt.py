@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 from dscp_core.errors import InvalidInputError
 from dscp_core.planning.certificate import PlanVerifier
-from dscp_core.planning.plan import Plan, PlanOutcome, PlanStatus, TerminalTime
+from dscp_core.planning.plan import PlanOutcome, PlanStatus, TerminalTime
 from dscp_core.problem.declaration import TERMINAL_TIME, OptimalControlProblem
+from dscp_core.problem.trajectory import Plan
 from dscp_core.scp.scp import Iteration, Scp, ScpResult, ScpStatus
 
 Array = NDArray[np.float64]

@@ -168,7 +168,11 @@ class PlanVerifier:
         self._misses = CompiledFunction(
             "misses",
             [x, packed],
-            [_stack(trace(f"miss {m.name}", m.expression, x, parameters) for m in problem.misses)],
+            [
+                _stack(
+                    trace(f"miss {m.name}", m.expression, x, parameters) for m in problem.end_checks
+                )
+            ],
         )
 
     def rates(self, states: Array, controls: Array, parameters: Array) -> Array:
@@ -196,7 +200,7 @@ class PlanVerifier:
         checks: list[Check] = []
         if failure is None:
             missed = self._misses(flown[-1], parameters)[0]
-            for miss, value in zip(self._problem.misses, missed, strict=True):
+            for miss, value in zip(self._problem.end_checks, missed, strict=True):
                 checks.append(_check(miss.name, value, miss.tolerance, miss.unit, times[-1]))
         values = self._limits_along(flown, applied, parameters)
         named_values = self._problem.table.unpack(parameters)

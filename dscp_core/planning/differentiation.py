@@ -11,7 +11,8 @@ from dscp_core.gradients.gradient import Gradient, Method
 from dscp_core.gradients.losses import ConvergenceLoss, Loss
 from dscp_core.gradients.quantities import quantity
 from dscp_core.gradients.run import DifferentiationError, of_plan, settle
-from dscp_core.planning.plan import Plan, PlanOutcome, TerminalTime
+from dscp_core.planning.plan import PlanOutcome, TerminalTime
+from dscp_core.problem.trajectory import Plan
 from dscp_core.scp.scp import GRADIENT_TOLERANCE, Scp, ScpResult
 
 # How far the differentiated trajectory may be from the plan's, in units of the states' scales, and

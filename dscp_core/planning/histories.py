@@ -22,8 +22,8 @@ from dscp_core.planning.panels import (
     new_figure,
     verdict,
 )
-from dscp_core.planning.plan import Plan
 from dscp_core.problem.declaration import OptimalControlProblem, StagePoint, Where, named
+from dscp_core.problem.trajectory import Plan
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -138,7 +138,7 @@ def _pinned(problem: OptimalControlProblem, parameters: Mapping[str, Any]) -> di
 
 def _headline(problem: OptimalControlProblem, plan: Plan, certificate: PlanCertificate) -> str:
     text = f"{problem.name.replace('_', ' ')}, {verdict(certificate)}: {plan.terminal_time_s:.4g} s"
-    missed = {miss.name for miss in problem.misses}
+    missed = {miss.name for miss in problem.end_checks}
     for check in certificate.checks:
         if check.name in missed:
             text += f", {check.name.replace('_', ' ')} {check.worst_value:.3g} {check.unit}"

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dscp_core.planning.certificate import PlanCertificate
-from dscp_core.planning.plan import Plan
+from dscp_core.problem.trajectory import Plan
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -20,12 +20,13 @@ from dscp_core.gradients.quantities import quantity
 from dscp_core.planning.attempt import Attempt, Start
 from dscp_core.planning.certificate import PlanVerifier
 from dscp_core.planning.differentiation import differentiable, plan_gradient, suited_method
-from dscp_core.planning.plan import Plan, PlanOutcome, PlanStatus, TerminalTime
+from dscp_core.planning.plan import PlanOutcome, PlanStatus, TerminalTime
 from dscp_core.planning.remainder import Remainder
 from dscp_core.planning.settings import PlannerSettings, TerminalTimePredictor
 from dscp_core.problem.declaration import TERMINAL_TIME, OptimalControlProblem, named
 from dscp_core.problem.parameters import Value
 from dscp_core.problem.tracing import Tracer
+from dscp_core.problem.trajectory import Plan
 from dscp_core.scp.scp import Scp, ScpStatus
 from dscp_core.transcription.transcription import Transcription
 

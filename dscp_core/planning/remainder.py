@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dscp_core.planning.plan import Plan, TerminalTime
+from dscp_core.planning.plan import TerminalTime
+from dscp_core.problem.trajectory import Plan
 from dscp_core.transcription.layout import TrajectoryLayout
 
 Array = NDArray[np.float64]

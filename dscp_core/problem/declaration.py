@@ -21,6 +21,7 @@ from dscp_core.problem.algorithm import (
     algorithm_parameters,
 )
 from dscp_core.problem.elements import (
+    ACCEPTED_MISS,
     ConeConstraint,
     Constraint,
     CostTerm,
@@ -125,7 +126,8 @@ class OptimalControlProblem:
             leads nowhere; same arguments.
         least_time_parameters: Parameter values that make the terminal time the cost; empty where
             none do.
-        misses: Distances from the target that a certificate checks.
+        misses: Distances from the target that a certificate checks; empty for those of every
+            pinned state, see `end_checks`.
         control_states: Index of the state that each control acts on (for named-vector messages).
         formulation: Which of several forms of the problem this is; empty where there is one.
         extras: What it brings along, such as a figure of its own.
@@ -237,7 +239,7 @@ class OptimalControlProblem:
     def _check_names(self) -> None:
         limits = [c.name for c in (*self.path_constraints, *self.cone_constraints)]
         checks.distinct("states and controls", (v.name for v in (*self.states, *self.controls)))
-        checks.distinct("constraints and misses", [*limits, *(m.name for m in self.misses)])
+        checks.distinct("constraints and misses", [*limits, *(m.name for m in self.end_checks)])
         checks.distinct("constraints", limits, reserved=(TERMINAL_TIME,))
         checks.distinct("cost_terms", (t.name for t in self.cost_terms), reserved=DERIVED_COSTS)
         unknown = sorted(set(self.final_state) - {s.name for s in self.states}, key=str)
@@ -326,6 +328,20 @@ class OptimalControlProblem:
             start += self.table[name].size
         return values
 
+    @property
+    def end_checks(self) -> tuple[Miss, ...]:
+        """What a certificate checks at the end: the misses, or else every pinned state.
+
+        A pinned state may then be off by a hundredth of its scale.
+        """
+        if self.misses:
+            return self.misses
+        return tuple(
+            _miss(index, state, self.final_state[state.name])
+            for index, state in enumerate(self.states)
+            if state.name in self.final_state
+        )
+
     def vehicle_of(self, values: Mapping[str, Any]) -> dict[str, float | list[float]]:
         """The parameters that fix the optimum from a state, as JSON holds them.
 
@@ -359,6 +375,15 @@ _OPTIONAL_FUNCTIONS = (
     "check_state",
     "terminal_time_guess",
 )
+
+
+def _miss(index: int, state: Variable, final: Callable[[Parameters], ca.SX]) -> Miss:
+    return Miss(
+        f"miss_{state.name}",
+        lambda x, p: ca.fabs(x[index] - final(p)),
+        state.unit,
+        ACCEPTED_MISS * state.scale,
+    )
 
 
 def _restored(pickled: bytes, count: int, expressions: str) -> OptimalControlProblem:

@@ -85,6 +85,9 @@ class StagePoint:
 
 Parameters = Mapping[str, ca.SX]
 
+ACCEPTED_VIOLATION, ACCEPTED_MISS = 1e-3, 1e-2
+"""What a certificate accepts where a declaration does not say, in units of the scale."""
+
 
 @dataclass(frozen=True)
 class Constraint:
@@ -99,7 +102,8 @@ class Constraint:
         skip_first: Leave out the first node or interval (its state is pinned).
         skip_last: Leave out the last node or interval.
         tolerance: Violation of the flown trajectory that a certificate accepts, in ``unit``; a
-            function of the parameters' values where it grows with the vehicle.
+            function of the parameters' values where it grows with the vehicle; None for a
+            thousandth of the scale.
     """
 
     name: str
@@ -109,16 +113,18 @@ class Constraint:
     where: Where = Where.NODE
     skip_first: bool = False
     skip_last: bool = False
-    tolerance: float | Callable[[Mapping[str, Any]], float] = 0.0
+    tolerance: float | Callable[[Mapping[str, Any]], float] | None = None
 
     def __post_init__(self) -> None:
         checks.positive(f"scale of constraint {self.name}", self.scale)
         checks.function(f"constraint {self.name}", self.expression)
-        if not callable(self.tolerance):
+        if self.tolerance is not None and not callable(self.tolerance):
             checks.not_negative(f"tolerance of constraint {self.name}", self.tolerance)
 
     def accepted(self, values: Mapping[str, Any]) -> float:
         """The tolerance for a vehicle's values by name."""
+        if self.tolerance is None:
+            return ACCEPTED_VIOLATION * self.scale
         return self.tolerance(values) if callable(self.tolerance) else self.tolerance
 
 

@@ -12,14 +12,12 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from dscp_core.problem.messages import Messages
 from dscp_core.problem.scene import SceneOf
+from dscp_core.problem.trajectory import Plan
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from matplotlib.figure import Figure
-
-    from dscp_core.planning.certificate import PlanCertificate
-    from dscp_core.planning.plan import Plan
 
 
 class PlanFigure(Protocol):
@@ -28,7 +26,7 @@ class PlanFigure(Protocol):
     def __call__(
         self,
         plan: Plan,
-        certificate: PlanCertificate,
+        certificate: Any,
         parameters: Mapping[str, Any],
         title: str | None = None,
     ) -> Figure:
@@ -36,7 +34,7 @@ class PlanFigure(Protocol):
 
         Args:
             plan: The plan.
-            certificate: Its certificate, with the flight.
+            certificate: Its `PlanCertificate` of `dscp_core.planning.certificate`, with the flight.
             parameters: Vehicle and mission by name, SI, as `ParameterTable.unpack` gives them.
             title: Headline; None for one of its own.
         """

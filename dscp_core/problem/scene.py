@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from dscp_core.planning.plan import Plan
+from dscp_core.problem.trajectory import Plan
 
 Array = NDArray[np.float64]
 
@@ -105,5 +104,5 @@ class Scene:
     shapes: tuple[Line | Arrows | Sphere | Triangles, ...] = ()
 
 
-SceneOf = Callable[["Plan", Mapping[str, Any], Mapping[str, Any]], Scene]
+SceneOf = Callable[[Plan, Mapping[str, Any], Mapping[str, Any]], Scene]
 """Scene of a plan, its parameters by name (SI) and the settings of `Messages` by name."""

@@ -43,7 +43,7 @@ class MissLoss:
             InvalidInputError: The problem declares no misses.
         """
         problem, layout = transcription.problem, transcription.layout
-        if not problem.misses:
+        if not problem.end_checks:
             raise InvalidInputError("loss", "miss", f"a problem with misses, not {problem.name}")
         reference = ca.MX.sym("reference", layout.reference_size)
         packed = ca.MX.sym("p", problem.table.size)
@@ -117,5 +117,5 @@ def _miss(transcription: Transcription) -> ca.Function:
     x, packed = ca.SX.sym("x", layout.nx), ca.SX.sym("p", problem.table.size)
     parameters = named(problem, packed)
     state = x * ca.DM(layout.state_scale)
-    relative = [m.expression(state, parameters) / m.tolerance for m in problem.misses]
+    relative = [m.expression(state, parameters) / m.tolerance for m in problem.end_checks]
     return ca.Function("miss", [x, packed], [ca.norm_2(ca.vertcat(*relative))])

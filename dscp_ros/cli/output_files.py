@@ -15,8 +15,8 @@ from dscp_core.errors import InvalidInputError
 from dscp_ros.cli.arguments import json_ready
 
 if TYPE_CHECKING:
-    from dscp_core.planning.plan import Plan
     from dscp_core.problem.declaration import OptimalControlProblem
+    from dscp_core.problem.trajectory import Plan
 
 
 def check_output_path(option: str, path: Path, suffixes: tuple[str, ...]) -> None:

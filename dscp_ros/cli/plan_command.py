@@ -27,9 +27,10 @@ from dscp_ros.cli.output_files import (
 
 if TYPE_CHECKING:
     from dscp_core.planning.certificate import PlanCertificate
-    from dscp_core.planning.plan import Plan, PlanOutcome
+    from dscp_core.planning.plan import PlanOutcome
     from dscp_core.planning.planner import Planner
     from dscp_core.problem.declaration import OptimalControlProblem
+    from dscp_core.problem.trajectory import Plan
 
 DESCRIPTION = """\
 Plans one trajectory and certifies it: the true dynamics are integrated under the planned controls,
@@ -212,7 +213,7 @@ def _flyable(outcome: PlanOutcome) -> Plan | None:
 def _certificate(problem: OptimalControlProblem, certificate: PlanCertificate) -> dict[str, Any]:
     worst = {check.name: check.worst_value for check in certificate.checks}
     # Missing where the flight could not be integrated to its end.
-    missed = {with_unit(miss.name, miss.unit): worst.get(miss.name) for miss in problem.misses}
+    missed = {with_unit(miss.name, miss.unit): worst.get(miss.name) for miss in problem.end_checks}
     used = certificate.mass_used_kg
     return {
         "passed": certificate.passed,

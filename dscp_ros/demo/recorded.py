@@ -9,8 +9,8 @@ from typing import Any
 
 from dscp_core import problems
 from dscp_core.planning.certificate import PlanCertificate, PlanVerifier
-from dscp_core.planning.plan import Plan
 from dscp_core.problem.declaration import OptimalControlProblem
+from dscp_core.problem.trajectory import Plan
 from dscp_ros.bag import BagReader
 from dscp_ros.demo.session import TRAJECTORY
 from dscp_ros.demo.summary import Figures

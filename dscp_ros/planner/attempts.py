@@ -9,7 +9,8 @@ from collections.abc import Callable, Collection
 from concurrent.futures import Future
 from dataclasses import dataclass
 
-from dscp_core.planning.plan import Plan, PlanOutcome, PlanStatus
+from dscp_core.planning.plan import PlanOutcome, PlanStatus
+from dscp_core.problem.trajectory import Plan
 from dscp_ros.planner.health import HealthMonitor
 from dscp_ros.planner.input_checks import AcceptedState
 from dscp_ros.planner.outputs import PlanOutputs

@@ -91,7 +91,7 @@ class PlannerNode:
             self._health,
             layout,
             surroundings,
-            [miss.name for miss in problem.misses],
+            [miss.name for miss in problem.end_checks],
         )
         self._worker: MailboxWorker[PlanJob] = MailboxWorker(self._runner.run, name="planner")
         self._parameters.on_change(self._on_settings)

@@ -9,7 +9,7 @@ from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy
 from trajectory_msgs.msg import JointTrajectory
 from visualization_msgs.msg import MarkerArray
 
-from dscp_core.planning.plan import Plan
+from dscp_core.problem.trajectory import Plan
 from msg_adapters.diagnostics import Health, message_from_health
 from msg_adapters.drawing import Drawing, no_markers
 from msg_adapters.layout import StateLayout

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from dscp_core.planning.plan import Plan, PlanOutcome, PlanStatus
+from dscp_core.planning.plan import PlanOutcome, PlanStatus
 from dscp_core.planning.planner import Planner, PlannerSettings, TerminalTimePredictor
 from dscp_core.problem.declaration import OptimalControlProblem
+from dscp_core.problem.trajectory import Plan
 from msg_adapters.stamps import seconds_from_nanoseconds
 from msg_adapters.state import StampedState
 

@@ -314,3 +314,65 @@ def test_declarations_that_are_wrong_are_refused_in_words(
     code, refused = run(capsys, "plan", f"{folder}/changed.py:BAD")
     assert code == ExitCode.BAD_INPUT
     assert said in refused["error"]["message"]
+
+
+CHAIN = """
+import casadi as ca
+from dscp_core import InitialGuess, OptimalControlProblem, Parameter, Variable
+
+
+def chain(n, **cost):
+    return OptimalControlProblem(
+        name="chain",
+        states=tuple(Variable(f"x{i}", "m", 1.0, "") for i in range(n)),
+        controls=(Variable("u", "m/s", 1.0, ""),),
+        parameters=(
+            Parameter("terminal_time", 2.0, "s", ""),
+            Parameter("start", (0.0,) * n, "m", ""),
+        ),
+        dynamics=lambda x, u, p: ca.vertcat(*(x[i + 1] - x[i] for i in range(n - 1)), u - x[n - 1]),
+        initial_state=lambda p: p["start"],
+        initial_state_parameters=("start",),
+        final_state={f"x{n - 1}": lambda p: 0.1},
+        terminal_cost=lambda x, t, p: 0.0 * t,
+        cost_scale=1.0,
+        initial_guess=lambda p, k: InitialGuess(ca.MX(n, k + 1), ca.MX(1, k + 1)),
+        **cost,
+    )
+
+
+def long():
+    return chain(500, running_cost=lambda x, u, p: u[0] ** 2)
+
+
+def no_cost():
+    return chain(2)
+
+
+def no_states():
+    return chain(0, running_cost=lambda x, u, p: u[0] ** 2)
+"""
+
+
+@pytest.mark.parametrize(("name", "said"), [("no_cost", "no cost"), ("no_states", "states")])
+def test_without_cost_or_states_there_is_no_problem(
+    folder: Path, name: str, said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (folder / "chain.py").write_text(CHAIN, encoding="utf-8")
+    for command in (["plan"], ["gradient", "--of", "cost", "--wrt", "start"]):
+        code, refused = run(capsys, command[0], f"{folder}/chain.py:{name}", *command[1:])
+        assert code == ExitCode.BAD_INPUT
+        assert said in refused["error"]["message"]
+
+
+@pytest.mark.slow
+def test_five_hundred_states_are_planned_and_not_all_printed(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (folder / "chain.py").write_text(CHAIN, encoding="utf-8")
+    picture = tmp_path / "chain.png"
+    assert main(["plan", f"{folder}/chain.py:long", "--plot", str(picture)]) == ExitCode.OK
+    text = capsys.readouterr().out
+    assert "certified, converged" in text.splitlines()[0]
+    assert text.count("final x") == 8
+    assert picture.read_bytes().startswith(PNG_SIGNATURE)

@@ -18,10 +18,10 @@ from visualization_msgs.msg import Marker
 
 from dscp_core.errors import InvalidInputError
 from dscp_core.planning.certificate import Check, ControlHold, PlanCertificate
-from dscp_core.planning.plan import Plan
 from dscp_core.problem.extras import Extras
 from dscp_core.problem.messages import Messages, StateLimit, StateLimitError
 from dscp_core.problem.scene import Arrows, Line, Scene, Sphere, Triangles
+from dscp_core.problem.trajectory import Plan
 from msg_adapters.drawing import Drawing
 from msg_adapters.errors import InputCode, RejectedInputError
 from msg_adapters.joint_state import joint_state_from_state, state_from_joint_state

@@ -18,7 +18,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from dscp_core import problems
 from dscp_core.errors import InvalidInputError
-from dscp_core.planning.plan import Plan
+from dscp_core.problem.trajectory import Plan
 from dscp_core.problems.entry.messages import PLANET_FRAME, EntryLimits, turned
 from dscp_core.problems.entry.planet import planet_fixed
 from dscp_core.problems.entry.scene import EntryStyle, entry_scene

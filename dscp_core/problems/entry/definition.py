@@ -47,8 +47,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from dscp_core.planning.certificate import PlanCertificate
-    from dscp_core.planning.plan import Plan
     from dscp_core.problem.scene import Scene
+    from dscp_core.problem.trajectory import Plan
 
 NAME = "entry"
 

@@ -24,7 +24,7 @@ from dscp_core.planning.panels import (
     new_figure,
     verdict,
 )
-from dscp_core.planning.plan import Plan
+from dscp_core.problem.trajectory import Plan
 from dscp_core.problems.entry.physics import (
     ALPHA,
     BANK,

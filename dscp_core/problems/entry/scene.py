@@ -16,7 +16,7 @@ from dscp_core.problem.scene import Arrows, Colour, Line, Scene, Sphere
 from dscp_core.problems.entry.planet import planet_fixed
 
 if TYPE_CHECKING:
-    from dscp_core.planning.plan import Plan
+    from dscp_core.problem.trajectory import Plan
 
 _TRACK_COLOUR: Colour = (0.9, 0.9, 0.2, 0.9)
 _PLANET_COLOUR: Colour = (0.2, 0.35, 0.6, 0.6)

@@ -22,7 +22,7 @@ from dscp_core.planning.panels import (
     new_figure,
     verdict,
 )
-from dscp_core.planning.plan import Plan
+from dscp_core.problem.trajectory import Plan
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -20,7 +20,7 @@ from dscp_core.problem.scene import Arrows, Line, Scene, Triangles
 from dscp_core.problems.powered_descent.messages import message_from_core
 
 if TYPE_CHECKING:
-    from dscp_core.planning.plan import Plan
+    from dscp_core.problem.trajectory import Plan
 
 Array = NDArray[np.float64]
 

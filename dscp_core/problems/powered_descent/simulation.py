@@ -15,9 +15,10 @@ import scipy.integrate
 from numpy.typing import NDArray
 
 from dscp_core.errors import DscpError, InvalidInputError
-from dscp_core.planning.plan import Plan, PlanOutcome, PlanStatus
+from dscp_core.planning.plan import PlanOutcome, PlanStatus
 from dscp_core.planning.planner import Planner, PlannerSettings
 from dscp_core.problem.declaration import named
+from dscp_core.problem.trajectory import Plan
 from dscp_core.problems.powered_descent.definition import powered_descent
 from dscp_core.transcription.compiled import CompiledFunction
 

@@ -1,7 +1,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -18,6 +18,9 @@ from oracles.powered_descent_physics import (
 from dscp_core import problems
 from dscp_core.errors import InvalidInputError
 from dscp_core.planning.certificate import Check, ControlHold, PlanCertificate, PlanVerifier
+from dscp_core.planning.plan import PlanStatus
+from dscp_core.planning.planner import Planner
+from dscp_core.problem.declaration import PathConstraint
 from dscp_core.scp.scp import Scp, ScpStatus
 from dscp_core.transcription.transcription import Transcription
 
@@ -228,7 +231,8 @@ def test_problem_without_misses_or_mass() -> None:
         layout.controls(result.final_reference),
         result.parameters,
     )
-    assert [c.name for c in certificate.checks] == ["force_max", "force_min"]
+    names = [c.name for c in certificate.checks]
+    assert names == ["miss_position", "miss_speed", "force_max", "force_min"]
     assert certificate.mass_used_kg is None
     # The midpoint rule's error with ten intervals.
     np.testing.assert_allclose(certificate.states[-1], [1.0, 0.0], atol=5e-3)
@@ -238,3 +242,34 @@ def test_start_of_the_paper_is_flown(plan: Solved, verifier: PlanVerifier) -> No
     certificate = certify(verifier, plan, plan.controls)
     # Scaling and back.
     np.testing.assert_allclose(certificate.states[0], PAPER_INITIAL_STATE, rtol=1e-9)
+
+
+def test_without_misses_every_pinned_state_is_checked() -> None:
+    problem = replace(cart(), initial_state_parameters=("start",))
+    outcome = Planner(problem).plan()
+    assert outcome.certificate is not None
+    bounds = {check.name: check.bound for check in outcome.certificate.checks}
+    assert (bounds["miss_position"], bounds["miss_speed"]) == (0.02, 0.005)
+    assert outcome.status is PlanStatus.CERTIFIED
+    # The same controls, flown for another mass, end elsewhere: that is no certified plan.
+    plan = outcome.plan
+    assert plan is not None
+    heavier = problem.pack({"mass": 1.6})
+    certificate = PlanVerifier(problem, 50).certify(
+        plan.times_s, plan.states, plan.controls, heavier
+    )
+    assert not certificate.passed
+    assert "miss_position" in certificate.reasons[0]
+
+
+def test_a_constraint_without_a_tolerance_accepts_a_thousandth_of_its_scale() -> None:
+    outcome = Planner(replace(cart(), initial_state_parameters=("start",))).plan()
+    assert outcome.certificate is not None
+    bounds = {check.name: check.bound for check in outcome.certificate.checks}
+    assert bounds["force_max"] == bounds["force_min"] == pytest.approx(3e-3)
+
+
+def test_a_constraint_may_not_have_the_name_of_an_end_check() -> None:
+    clash = PathConstraint("miss_speed", lambda at, p: at.x[1] - 1.0, 1.0, "m/s")
+    with pytest.raises(InvalidInputError, match="miss_speed"):
+        replace(cart(), path_constraints=(clash,))

@@ -14,8 +14,9 @@ from dscp_core import problems
 from dscp_core.cone.solvers import SolverSettings
 from dscp_core.errors import InvalidInputError
 from dscp_core.planning.certificate import ControlHold
-from dscp_core.planning.plan import Plan, PlanOutcome, PlanStatus
+from dscp_core.planning.plan import PlanOutcome, PlanStatus
 from dscp_core.planning.planner import Planner, PlannerSettings, TerminalTime
+from dscp_core.problem.trajectory import Plan
 from dscp_core.scp.scp import ScpOptions
 
 Array = NDArray[np.float64]

@@ -9,9 +9,10 @@ from oracles.powered_descent_physics import PAPER_INITIAL_STATE
 
 from dscp_core import problems
 from dscp_core.errors import InvalidInputError
-from dscp_core.planning.plan import Plan, PlanOutcome, PlanStatus
+from dscp_core.planning.plan import PlanOutcome, PlanStatus
 from dscp_core.planning.planner import Planner, PlannerSettings, TerminalTime
 from dscp_core.planning.terminal_time_network import TerminalTimeNetwork
+from dscp_core.problem.trajectory import Plan
 from dscp_core.problems.powered_descent.definition import NETWORK
 
 Array = NDArray[np.float64]
