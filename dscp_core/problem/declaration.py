@@ -36,7 +36,7 @@ from dscp_core.problem.elements import (
 )
 from dscp_core.problem.extras import Extras
 from dscp_core.problem.parameters import Parameter, ParameterTable, Value, load_parameter_file
-from dscp_core.problem.tracing import called
+from dscp_core.problem.tracing import KnownParameters, called
 
 Symbol = TypeVar("Symbol", ca.SX, ca.MX)
 
@@ -394,4 +394,6 @@ def _restored(pickled: bytes, count: int, expressions: str) -> OptimalControlPro
 
 def named(problem: OptimalControlProblem, packed: Symbol) -> dict[str, Symbol]:
     """Parameters by name from their packed symbol."""
-    return {name: packed[problem.table.slice(name)] for name in problem.table.names}
+    return KnownParameters(
+        (name, packed[problem.table.slice(name)]) for name in problem.table.names
+    )

@@ -17,6 +17,22 @@ from dscp_core.problem.parameters import ParameterTable
 _LONGEST_MESSAGE = 300
 
 
+class UnknownParameterError(KeyError):
+    """A function of a declaration asks for a parameter that there is not."""
+
+
+class KnownParameters(dict[str, Any]):
+    """Parameters by name; tells an unknown one from a `KeyError` of a user's own."""
+
+    def __missing__(self, name: str) -> Any:
+        """Refuse it.
+
+        Raises:
+            UnknownParameterError: Always.
+        """
+        raise UnknownParameterError(name)
+
+
 class Tracer:
     """Calls functions with expressions of known symbols; names the function that is wrong."""
 
@@ -107,17 +123,16 @@ def _refusal(
     what: str, table: ParameterTable, error: Exception, expected: str
 ) -> InvalidInputError:
     place = _place(error)
-    if isinstance(error, KeyError) and error.args and error.args[0] not in table.names:
-        name = error.args[0]
-        known = ", ".join(table.names)
-        return InvalidInputError(what, f"parameter {name!r}{place}", f"one of {known}")
+    if isinstance(error, UnknownParameterError):
+        bound = f"one of {', '.join(table.names)}"
+        return InvalidInputError(what, f"parameter {error.args[0]!r}{place}", bound)
     message = " ".join(f"{type(error).__name__}: {error}".split())[:_LONGEST_MESSAGE]
     return InvalidInputError(what, message + place, expected)
 
 
 def _place(error: Exception) -> str:
-    """File and line of the innermost frame that is neither CasADi's nor this module's."""
-    own = (f"{os.sep}casadi{os.sep}", __file__)
+    """File and line of the innermost frame that is neither CasADi's nor this package's."""
+    own = (f"{os.sep}casadi{os.sep}", f"{Path(__file__).parent}{os.sep}")
     frames = [
         frame
         for frame in traceback.extract_tb(error.__traceback__)

@@ -88,6 +88,8 @@ def analyse(
     problem: OptimalControlProblem,
     intervals: int,
     guess: Callable[[Array], tuple[Array, Array]],
+    *,
+    free: bool,
 ) -> CostAnalysis:
     """Find out what the costs are.
 
@@ -95,6 +97,7 @@ def analyse(
         problem: The declaration.
         intervals: Number N.
         guess: States (N+1, nx) and controls (N+1, nu) of the initial guess, SI, by parameters.
+        free: Whether the terminal time is a decision: then the interval length is one too.
 
     Raises:
         InvalidInputError: Cost terms that are no model of the running cost, or no cost at all and
@@ -102,12 +105,15 @@ def analyse(
     """
     symbolic = _Symbolic(problem, intervals)
     samples = symbolic.sample(guess)
-    sizes = np.maximum(np.abs(samples.elsewhere).max(axis=2), np.abs(samples.terms).max(axis=2))
-    steep = (np.abs(samples.terms).max(axis=2) > _ZERO * sizes).any(axis=0)
+    decided = slice(None) if free else slice(-1)
+    found = np.abs(samples.terms[:, :, decided]).max(axis=2)
+    sizes = np.maximum(np.abs(samples.elsewhere[:, :, decided]).max(axis=2), found)
+    steep = (found > _ZERO * sizes).any(axis=0)
     models = [term for term, is_steep in zip(problem.cost_terms, steep, strict=True) if is_steep]
     running = CostForm.DECLARED
     if models:
-        _require_model(problem, [m.name for m in models], samples)
+        gradients = samples.terms.sum(axis=1)[:, decided], samples.running[:, decided]
+        _require_model(problem, [m.name for m in models], *gradients)
     elif problem.running_cost is None:
         running = CostForm.NONE
     else:
@@ -135,18 +141,19 @@ def _form(is_quadratic: bool, hessians: list[Array]) -> CostForm:
     return CostForm.EXACT
 
 
-def _require_model(problem: OptimalControlProblem, names: list[str], samples: _Samples) -> None:
-    """Refuse cost terms whose gradient at the reference is not that of the running cost."""
-    found = samples.terms.sum(axis=1)
-    size = max(float(np.abs(found).max()), float(np.abs(samples.running).max()))
-    off = np.abs(found - samples.running)
+def _require_model(
+    problem: OptimalControlProblem, names: list[str], found: Array, running: Array
+) -> None:
+    """Refuse cost terms whose gradients at their references are not those of the running cost."""
+    size = max(float(np.abs(found).max()), float(np.abs(running).max()))
+    off = np.abs(found - running)
     if float(off.max()) <= _EQUAL * size:
         return
     point, index = np.unravel_index(int(np.argmax(off)), off.shape)
     expected = "0: no running_cost is declared"
     if problem.running_cost is not None:
-        expected = f"that of T times the running_cost, {samples.running[point, index]:.6g}"
-    along = [*(s.name for s in problem.states), *(c.name for c in problem.controls)]
+        expected = f"that of T times the running_cost, {running[point, index]:.6g}"
+    along = [v.name for v in (*problem.states, *problem.controls)]
     component = along[index] if index < len(along) else "the interval length"
     raise InvalidInputError(
         f"cost_terms {', '.join(names)}",

@@ -169,7 +169,7 @@ def build_stages(problem: OptimalControlProblem, layout: TrajectoryLayout) -> St
         states, controls = guessed(parameters)
         return states.full(), controls.full()
 
-    costs = analyse(problem, layout.intervals, numbers)
+    costs = analyse(problem, layout.intervals, numbers, free=layout.free_terminal_time)
     summed = single if costs.where is Where.NODE else pair
     point = summed.at(costs.where, summed.reference)
     return StageFunctions(

@@ -110,6 +110,57 @@ def test_refused_by_name(changes: dict[str, Any], message: str) -> None:
         Transcription(replace(CART, **changes), 4)
 
 
+PLACES: dict[str, Any] = {
+    "dynamics": lambda f: {"dynamics": f},
+    "initial_state": lambda f: {"initial_state": f},
+    "final_state speed": lambda f: {"final_state": {"speed": f}},
+    "running_cost": lambda f: {"running_cost": f},
+    "terminal_cost": lambda f: {"terminal_cost": f},
+    "constraint limit": path,
+    "constraint ball": cone,
+    "cost term bend": lambda f: {"cost_terms": (CostTerm("bend", f),)},
+    "initial_guess": lambda f: {"initial_guess": f},
+}
+WRONG = (
+    None,
+    "text",
+    [1.0, 2.0],
+    {},
+    object(),
+    1j,
+    math.nan,
+    np.array(["a"]),
+    np.ones((2, 2, 2)),
+    ca.MX(2, 1),
+    ca.SX(3, 7),
+    ca.SX.sym("other", 2),
+)
+ERRORS = (
+    ValueError("no"),
+    ZeroDivisionError(),
+    KeyError(),
+    KeyError("a", 1),
+    RecursionError("deep"),
+)
+
+
+@pytest.mark.parametrize("what", PLACES)
+def test_whatever_a_function_does_it_is_named(what: str) -> None:
+    for value in WRONG:
+        with pytest.raises(InvalidInputError, match=what):
+            Transcription(replace(CART, **PLACES[what](lambda *_, value=value: value)), 4)
+    for error in ERRORS:
+
+        def fails(*_: Any, error: Exception = error) -> None:
+            raise error
+
+        with pytest.raises(
+            InvalidInputError, match=rf"{what}: got .*{type(error).__name__}"
+        ) as why:
+            Transcription(replace(CART, **PLACES[what](fails)), 4)
+        assert why.value.__cause__ is error
+
+
 @pytest.mark.parametrize(
     ("bounds", "message"),
     [
