@@ -1,8 +1,8 @@
 """Own log to tuned planner: states from a CSV file become a bag, and the bag a parameter set.
 
-The log has the states in which a quadrotor asked for plans. Its planner weighs changes of the pitch
-heavily and converges slowly. `dscp tune` finds a better weight through the derivatives of whole
-runs from the first 80 % of the log, and judges it by the others.
+The log has states in which a quadrotor asked for plans (here drawn at random about hover). Its
+planner weighs changes of the pitch heavily and converges slowly. `dscp tune` finds a better weight
+through the derivatives of whole runs from the first 80 % of the log, and judges it by the others.
 """
 
 import argparse
