@@ -11,11 +11,11 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import torch
 
-from dscp_core import Planner, PlannerSettings, problems
+from dscp_core import Planner, problems
 
 torch.set_default_dtype(torch.float64)
-settings = PlannerSettings(intervals=20, parameters={"terminal_time": 34.0})
-planner = Planner(problems.get("powered_descent"), settings)
+descent = problems.get("powered_descent")
+planner = Planner(descent, intervals=20, parameters={"terminal_time": 34.0})
 layer = planner.layer("mass", inputs=("initial_state",))
 
 

@@ -79,8 +79,7 @@ def main(output):
     errors = {}
     print(f"{'N':>4} {'cost':>9} {'error':>8}   (analytic cost {least:.4f} m^2/s^3)")
     for intervals in (10, 20, 40, 80, 160):
-        settings = dscp.PlannerSettings.suited(double_integrator, intervals=intervals)
-        planner = dscp.Planner(double_integrator, settings)
+        planner = dscp.Planner(double_integrator, intervals=intervals)
         outcome = planner.plan()
         errors[intervals] = abs(outcome.cost - least)
         print(f"{intervals:4} {outcome.cost:9.5f} {errors[intervals]:8.5f}")

@@ -11,7 +11,7 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import torch
 
-from dscp_core import Planner, PlannerSettings, TerminalTime, problems
+from dscp_core import Planner, problems
 
 VEHICLE = Path(__file__).parents[1] / "config" / "vehicles" / "mars_lander.yaml"
 STEPS, BATCH = 30, 5
@@ -19,7 +19,7 @@ STEPS, BATCH = 30, 5
 torch.set_default_dtype(torch.float64)
 torch.manual_seed(0)
 descent = problems.get("powered_descent")
-planner = Planner(descent, PlannerSettings(intervals=20), vehicle=VEHICLE)
+planner = Planner(descent, vehicle=VEHICLE, intervals=20)
 centre = torch.tensor(planner.initial_state)
 spread = torch.tensor([200.0, 300.0, 300.0, 10.0, 10.0, 10.0, 50.0])
 final_mass = planner.layer("mass", inputs=("initial_state", "terminal_time"))
@@ -32,8 +32,7 @@ def draw(count):
 
 def best_flights(states):
     """Propellant in kg and terminal time in s of plans with a free terminal time."""
-    settings = PlannerSettings(intervals=20, terminal_time=TerminalTime.FREE)
-    free = Planner(descent, settings, vehicle=VEHICLE)
+    free = Planner(descent, vehicle=VEHICLE, intervals=20, terminal_time="free")
     plans = [free.plan(state).plan for state in states.numpy()]
     masses = torch.tensor([plan.states[-1, 6] for plan in plans])
     return states[:, 6] - masses, torch.tensor([plan.terminal_time_s for plan in plans])

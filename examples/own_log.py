@@ -19,7 +19,7 @@ from builtin_interfaces.msg import Time
 from quadrotor_past_obstacle import quadrotor
 from sensor_msgs.msg import JointState
 
-from dscp_core import Planner, PlannerSettings, ScpOptions
+from dscp_core import Planner, ScpOptions
 from dscp_ros.bag.writer import BagWriter
 
 HERE = Path(__file__).parent
@@ -52,8 +52,7 @@ def tune(bag, output):
 def iterations(weights, states):
     """Iterations of the plans from some states, with the options of the node that flew."""
     options = ScpOptions(max_iterations=60, cost_tolerance=1e-6)
-    settings = PlannerSettings.suited(quadrotor, options=options)
-    planner = Planner(quadrotor, settings, parameters=weights)
+    planner = Planner(quadrotor, parameters=weights, options=options)
     return np.array([planner.plan(state).iterations for state in states])
 
 

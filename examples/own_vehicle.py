@@ -10,30 +10,34 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import numpy as np
 
-from dscp_core import Planner, PlannerSettings, TerminalTime, problems
+from dscp_core import Planner, problems
 
 VEHICLE = Path(__file__).parent / "data" / "lunar_lander.yaml"
 VARIED = ("initial_mass", "specific_impulse", "thrust_max", "pointing_angle_max")
 
 descent = problems.get("powered_descent")
-settings = PlannerSettings.suited(descent, terminal_time=TerminalTime.FREE)
+
+
+def planner(**changed):
+    """A planner of the vehicle, with changed parameters."""
+    return Planner(descent, vehicle=VEHICLE, parameters=changed, terminal_time="free")
 
 
 def touchdown_mass(name, value):
     """Mass at touchdown of a changed vehicle, kg; NaN where it has no certified plan."""
-    outcome = Planner(descent, settings, vehicle=VEHICLE, parameters={name: value}).plan()
+    outcome = planner(**{name: value}).plan()
     return outcome.plan.states[-1, 6] if outcome.certified else np.nan
 
 
 def main(output):
     """Plan, differentiate, plan again with changed vehicles, draw."""
     output.mkdir(parents=True, exist_ok=True)
-    planner = Planner(descent, settings, vehicle=VEHICLE)
-    outcome = planner.plan()
+    own = planner()
+    outcome = own.plan()
     print(outcome.headline)
-    planner.figure(outcome).savefig(output / "own_vehicle.png")
+    own.figure(outcome).savefig(output / "own_vehicle.png")
 
-    gradient = planner.gradient("mass", at=outcome)
+    gradient = own.gradient("mass", at=outcome)
     print(gradient.headline)
     print(f"{'parameter':20} {'value':>8}       kg at touchdown per 1 %")
     figure, panels = plt.subplots(1, len(VARIED), figsize=(13, 3), layout="constrained")

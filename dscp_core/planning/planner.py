@@ -67,6 +67,7 @@ class Planner:
         *,
         vehicle: str | Path | None = None,
         parameters: Mapping[str, Value] | None = None,
+        **changes: Any,
     ) -> None:
         """Compile the problem.
 
@@ -76,6 +77,7 @@ class Planner:
             predictor: Needed for, and only for, `TerminalTime.PREDICTED`.
             vehicle: YAML file of parameter names and SI values, which win over the settings'.
             parameters: Values by name, SI, which win over both.
+            **changes: Other settings by name, such as ``intervals=20``, which win.
 
         Raises:
             InvalidInputError: Unknown parameter or value, a file that cannot be used, a missing
@@ -88,7 +90,7 @@ class Planner:
         settings = PlannerSettings.suited(problem) if settings is None else settings
         changed = {} if vehicle is None else problem.read_vehicle(vehicle)
         changed |= parameters or {}
-        settings = replace(settings, parameters={**settings.parameters, **changed})
+        settings = replace(settings, **changes, parameters={**settings.parameters, **changed})
         if (settings.terminal_time is TerminalTime.PREDICTED) != (predictor is not None):
             raise InvalidInputError(
                 "predictor",

@@ -9,6 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from dscp_core.errors import InvalidInputError
 from dscp_core.planning.certificate import ControlHold
 from dscp_core.planning.plan import TerminalTime
 from dscp_core.problem.declaration import OptimalControlProblem
@@ -34,6 +35,8 @@ class TerminalTimePredictor(Protocol):
 class PlannerSettings:
     """How to plan, and with which parameters; `suited` has what suits a problem.
 
+    The terminal time and the hold may be given by their values too, such as ``"free"``.
+
     Attributes:
         parameters: Vehicle, mission and algorithm parameters that differ from the defaults, SI.
         intervals: Number N of intervals.
@@ -53,6 +56,14 @@ class PlannerSettings:
     terminal_time: TerminalTime = TerminalTime.FIXED
     hold: ControlHold = ControlHold.MEAN
     options: ScpOptions = field(default_factory=ScpOptions)
+
+    def __post_init__(self) -> None:
+        for name, kind in (("terminal_time", TerminalTime), ("hold", ControlHold)):
+            try:
+                object.__setattr__(self, name, kind(getattr(self, name)))
+            except ValueError:
+                known = ", ".join(member.value for member in kind)
+                raise InvalidInputError(name, getattr(self, name), f"one of {known}") from None
 
     @staticmethod
     def suited(problem: OptimalControlProblem, **changes: Any) -> PlannerSettings:

@@ -385,3 +385,18 @@ def test_values_win_over_the_vehicle_and_both_over_the_settings() -> None:
     assert values["specific_impulse"] == read["specific_impulse"]
     assert values["gravity"] == 3.5 != read["gravity"]
     assert values["thrust_prox"] == 3.0
+
+
+def test_settings_by_name_win() -> None:
+    problem = problems.get("powered_descent")
+    given = PlannerSettings(intervals=30, parameters={"terminal_time": 34.0})
+    planner = Planner(problem, given, intervals=20, terminal_time="free")
+    assert (planner.settings.intervals, planner.settings.terminal_time) == (20, TerminalTime.FREE)
+    assert planner.settings.parameters == {"terminal_time": 34.0}
+    assert Planner(problems.get("entry"), intervals=20).settings.terminal_time is TerminalTime.FREE
+
+
+@pytest.mark.parametrize(("name", "value"), [("terminal_time", "sometimes"), ("hold", "none")])
+def test_settings_that_do_not_exist(name: str, value: str) -> None:
+    with pytest.raises(InvalidInputError, match=rf"{name}: got .{value}."):
+        Planner(problems.get("powered_descent"), **{name: value})
