@@ -42,7 +42,9 @@ if TYPE_CHECKING:
         Where,
     )
     from dscp_core.problem.extras import Extras
+    from dscp_core.problem.messages import Messages, Odometry
     from dscp_core.problem.parameters import Parameter
+    from dscp_core.problem.scene import Arrows, Line, Scene, Sphere, Triangles
     from dscp_core.problem.trajectory import Plan
     from dscp_core.problems.loading import ProblemFamily
     from dscp_core.scp.scp import ScpOptions
@@ -69,7 +71,9 @@ _HOMES = {
         "Where",
     ),
     "problem.extras": ("Extras",),
+    "problem.messages": ("Messages", "Odometry"),
     "problem.parameters": ("Parameter",),
+    "problem.scene": ("Arrows", "Line", "Scene", "Sphere", "Triangles"),
     "problem.trajectory": ("Plan",),
     "problems.loading": ("ProblemFamily",),
     "scp.scp": ("ScpOptions",),
@@ -77,6 +81,7 @@ _HOMES = {
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 
 __all__ = [
+    "Arrows",
     "ConeConstraint",
     "ConvergenceLoss",
     "CostLoss",
@@ -90,8 +95,11 @@ __all__ = [
     "Gradient",
     "InitialGuess",
     "InvalidInputError",
+    "Line",
+    "Messages",
     "Method",
     "Miss",
+    "Odometry",
     "OptimalControlProblem",
     "Parameter",
     "PathConstraint",
@@ -102,9 +110,12 @@ __all__ = [
     "Planner",
     "PlannerSettings",
     "ProblemFamily",
+    "Scene",
     "ScpOptions",
+    "Sphere",
     "StagePoint",
     "TerminalTime",
+    "Triangles",
     "Variable",
     "Where",
     "problems",

@@ -84,6 +84,7 @@ class AttemptFigures:
         solver: Backend that answered last.
         terminal_time_source: Where the terminal time comes from.
         terminal_time_reason: Why from there, where the node's settings name another source.
+        converged: Whether the iterations had settled; None in reports of before 2026-11.
     """
 
     iterations: int
@@ -99,6 +100,7 @@ class AttemptFigures:
     solver: str | None = None
     terminal_time_source: str | None = None
     terminal_time_reason: str | None = None
+    converged: bool | None = None
 
 
 @dataclass(frozen=True)
@@ -181,6 +183,7 @@ def attempt_from_outcome(outcome: PlanOutcome, deadline_s: float | None) -> Atte
         solver=outcome.solver or None,
         terminal_time_source=outcome.terminal_time_source.value,
         terminal_time_reason=outcome.terminal_time_reason or None,
+        converged=bool(outcome.converged),
     )
 
 

@@ -5,8 +5,8 @@ One status per message. Keys without a known value are left out. Keys:
 - always: ``code``, ``code_name``, ``source``, ``published``, ``drops``, ``rejected``
 - if known: ``input_stamp`` (seconds.nanoseconds), ``latency_ms``, ``mass_source``,
   ``parameter_set``, ``state.NAME``
-- after an attempt: ``iterations``, ``solve_time_ms``, ``solver_time_ms``, ``deadline_ms``,
-  ``virtual_control``, ``max_defect``, ``cost``, ``terminal_time_predicted_s``,
+- after an attempt: ``iterations``, ``converged``, ``solve_time_ms``, ``solver_time_ms``,
+  ``deadline_ms``, ``virtual_control``, ``max_defect``, ``cost``, ``terminal_time_predicted_s``,
   ``terminal_time_used_s``, ``terminal_time_source``, ``terminal_time_reason``, ``warm_started``,
   ``solver``
 - with a certificate: ``certificate.passed``, ``certificate.reason.K``, ``certificate.NAME_UNIT``
@@ -110,6 +110,7 @@ def _pairs(report: PlanReport) -> Iterator[tuple[str, Value]]:
         yield _STATE + name, float(value)
     if report.attempt is not None:
         yield "iterations", report.attempt.iterations
+        yield "converged", report.attempt.converged
         for key in _NUMBERS:
             yield key, getattr(report.attempt, key)
         yield "warm_started", report.attempt.warm_started
@@ -199,6 +200,7 @@ def _attempt(reader: KeyValueReader) -> AttemptFigures | None:
     return AttemptFigures(
         iterations=reader.integer("iterations"),
         warm_started=reader.boolean("warm_started"),
+        converged=reader.boolean("converged") if "converged" in reader.texts else None,
         solver=reader.optional_text("solver"),
         terminal_time_source=reader.optional_text("terminal_time_source"),
         terminal_time_reason=reader.optional_text("terminal_time_reason"),

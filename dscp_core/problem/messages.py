@@ -54,6 +54,11 @@ class Odometry:
         position: Names, in messages, of the position along x, y and z, m.
         velocity: Those of the velocity, m/s.
         mass: That of the mass, kg, or None. With the others, these are all states.
+
+    Example:
+        >>> from dscp_core import Odometry
+        >>> Odometry(mass="mass").names
+        ('x', 'y', 'z', 'vx', 'vy', 'vz', 'mass')
     """
 
     position: tuple[str, str, str] = ("x", "y", "z")
@@ -86,6 +91,11 @@ class Messages:
         defaults: Defaults of a planner's other settings that suit the problem, by name.
         admit: Checks a state's scalars; None for the bounds of the initial state's parameters and
             the problem's ``check_state``.
+
+    Example:
+        >>> from dscp_core import Extras, Messages, Odometry
+        >>> Extras(messages=Messages(frame="station", odometry=Odometry())).messages.frame
+        'station'
     """
 
     states: tuple[tuple[str, str], ...] = ()

@@ -29,6 +29,12 @@ class Line:
         points: (M, 3).
         width_m: Its width.
         colour: Its colour.
+
+    Example:
+        >>> import numpy as np
+        >>> from dscp_core import Line
+        >>> Line("path", np.zeros((3, 3)), width_m=2.0).points.shape
+        (3, 3)
     """
 
     name: str
@@ -47,6 +53,12 @@ class Arrows:
         vectors: (M, 3), from tail to tip.
         width_m: A line of this width; shafts are twice, heads four times as wide.
         colour: Their colour.
+
+    Example:
+        >>> import numpy as np
+        >>> from dscp_core import Arrows
+        >>> Arrows("thrust", np.zeros((5, 3)), np.ones((5, 3)), width_m=1.0).name
+        'thrust'
     """
 
     name: str
@@ -65,6 +77,12 @@ class Sphere:
         centre: (3,).
         radius_m: Its radius.
         colour: Its colour.
+
+    Example:
+        >>> import numpy as np
+        >>> from dscp_core import Sphere
+        >>> Sphere("keep_out", np.zeros(3), 50.0, colour=(1.0, 0.0, 0.0, 0.3)).radius_m
+        50.0
     """
 
     name: str
@@ -81,6 +99,13 @@ class Triangles:
         name: Unique name.
         corners: (3 M, 3), three rows per triangle.
         colour: Their colour.
+
+    Example:
+        >>> import numpy as np
+        >>> from dscp_core import Triangles
+        >>> pad = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+        >>> Triangles("pad", pad, colour=(0.5, 0.5, 0.5, 1.0)).corners.shape
+        (3, 3)
     """
 
     name: str
@@ -97,6 +122,14 @@ class Scene:
         attitudes: (N+1, 4) quaternions (x, y, z, w), or None for none.
         shapes: What is drawn. The names stay from plan to plan, so that a plan's shapes replace
             those of the plan before.
+
+    Example:
+        >>> from dscp_core import Extras, Line, Scene
+        >>> def scene(plan, parameters, settings):
+        ...     positions = plan.states[:, :3]
+        ...     return Scene(positions, shapes=(Line("path", positions, width_m=1.0),))
+        >>> Extras(scene=scene).scene is scene
+        True
     """
 
     positions: Array

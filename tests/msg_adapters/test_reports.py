@@ -41,6 +41,7 @@ attempts = st.builds(
     AttemptFigures,
     iterations=COUNTS,
     warm_started=st.booleans(),
+    converged=st.none() | st.booleans(),
     solver=st.none() | TEXT,
     terminal_time_source=st.none() | TEXT,
     terminal_time_reason=st.none() | TEXT,
@@ -144,6 +145,8 @@ def test_outcome_becomes_figures_in_milliseconds():
     assert attempt.terminal_time_used_s == 32.81
     assert attempt.terminal_time_predicted_s is None
     assert attempt.warm_started is True
+    assert attempt.converged is True
+    assert attempt_from_outcome(outcome(converged=False), 1.0).converged is False
     assert attempt.solver == "qoco"
     assert attempt.terminal_time_source == "free"
     assert attempt.terminal_time_reason is None
