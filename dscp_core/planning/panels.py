@@ -7,12 +7,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dscp_core.planning.certificate import PlanCertificate
 from dscp_core.problem.trajectory import Plan
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+    from dscp_core.planning.certificate import PlanCertificate
 
 Array = NDArray[np.float64]
 

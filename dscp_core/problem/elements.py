@@ -55,6 +55,11 @@ class Quadrature(Enum):
 
     TRAPEZOID: 1, and 1/2 at both ends; the error of the cost falls with the square of T. SUM: 1
     everywhere, as the paper sums; the error falls with T.
+
+    Example:
+        >>> from dscp_core import Quadrature, problems
+        >>> problems.get("entry").quadrature is Quadrature.SUM
+        True
     """
 
     TRAPEZOID = "trapezoid"

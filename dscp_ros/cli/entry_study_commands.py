@@ -12,7 +12,7 @@ from dscp_core.errors import InvalidInputError
 from dscp_ros.cli import ExitCode
 from dscp_ros.cli.arguments import print_json, print_table
 from dscp_ros.cli.options import add_computing, add_folder, add_json
-from dscp_ros.cli.output_files import complete_file, write_csv
+from dscp_ros.cli.output_files import check_folder, complete_file, write_csv
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -190,8 +190,7 @@ def _compute(
 ) -> GridResult:
     if args.jobs is not None and args.jobs < 1:
         raise InvalidInputError("--jobs", args.jobs, ">= 1")
-    if args.output.exists() and not args.output.is_dir():
-        raise InvalidInputError("--output", str(args.output), "a directory")
+    check_folder(args.output)
     from tqdm import tqdm
 
     from dscp_core.studies.grid import code_version, discard, run_grid

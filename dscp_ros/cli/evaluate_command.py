@@ -14,6 +14,7 @@ from dscp_core.errors import InvalidInputError
 from dscp_ros.cli import ExitCode
 from dscp_ros.cli.arguments import overrides, print_json, print_table
 from dscp_ros.cli.options import add_computing, add_json, add_values
+from dscp_ros.cli.output_files import check_folder
 
 if TYPE_CHECKING:
     from dscp_core.learning.evaluation import Measurement
@@ -114,8 +115,8 @@ def run_terminal_time(args: argparse.Namespace) -> int:
     for name in ("samples", "feasibility_samples"):
         if getattr(args, name) < 1:
             raise InvalidInputError(f"--{name.replace('_', '-')}", getattr(args, name), ">= 1")
-    if args.output is not None and args.output.exists() and not args.output.is_dir():
-        raise InvalidInputError("--output", str(args.output), "a directory")
+    if args.output is not None:
+        check_folder(args.output)
     from dscp_core import problems
     from dscp_core.learning.evaluator import OptimumModel
     from dscp_core.planning.terminal_time_network import TerminalTimeNetwork

@@ -19,6 +19,16 @@ if TYPE_CHECKING:
     from dscp_core.problem.trajectory import Plan
 
 
+def check_folder(path: Path) -> None:
+    """Refuses a place for files that is a file itself.
+
+    Raises:
+        InvalidInputError: It is.
+    """
+    if path.exists() and not path.is_dir():
+        raise InvalidInputError("--output", str(path), "a directory")
+
+
 def check_output_path(option: str, path: Path, suffixes: tuple[str, ...]) -> None:
     """Refuses a path that cannot be written to, before the work is done.
 

@@ -57,7 +57,8 @@ A vehicle file holds lines such as `initial_mass: 25000` and `initial_velocity: 
 
 --json prints one object: headline, status (certified, not_certified, infeasible, iteration_limit,
 deadline, solver_failure), message, certified, converged, terminal_time_s, iterations, cost,
-cost_unit, final_STATE_UNIT for every state (such as final_mass_kg), certificate (with MISS_UNIT for
+cost_unit, subproblem_costs (what the iterations minimise of the running and the terminal cost),
+final_STATE_UNIT for every state (such as final_mass_kg), certificate (with MISS_UNIT for
 every miss, such as miss_position_m), solve_time_ms, solver, virtual_control, max_defect,
 least_feasible_terminal_time_s. null stands for what does not exist.
 
@@ -148,6 +149,10 @@ def describe(planner: Planner, outcome: PlanOutcome, least_s: float | None) -> d
         },
         "cost": None if plan is None else outcome.cost,
         "cost_unit": problem.cost_unit,
+        "subproblem_costs": {
+            name: getattr(planner.transcription.costs, name).value
+            for name in ("running", "terminal")
+        },
         "iterations": outcome.iterations,
         "intervals": settings.intervals,
         "solver": outcome.solver,
@@ -160,6 +165,16 @@ def describe(planner: Planner, outcome: PlanOutcome, least_s: float | None) -> d
         else _certificate(problem, outcome.certificate),
         "parameters": outcome.parameters,
     }
+
+
+def _cost_forms(forms: dict[str, str]) -> str:
+    """What the iterations minimise of the costs, where that is not plainly the cost."""
+    told = [
+        f"{name} cost: {form}"
+        for name, form in forms.items()
+        if form not in ("none", "exact") or (name == "running" and form == "exact")
+    ]
+    return "; ".join(told)
 
 
 def _check(args: argparse.Namespace) -> None:
@@ -254,7 +269,8 @@ def _print(described: dict[str, Any], planner: Planner, outcome: PlanOutcome) ->
         rows.append(("least feasible", f"{described['least_feasible_terminal_time_s']:.4f} s", ""))
     plan = _flyable(outcome)
     if plan is not None:
-        rows.append(("cost", _quantity(outcome.cost, problem.cost_unit), ""))
+        cost = _quantity(outcome.cost, problem.cost_unit)
+        rows.append(("cost", cost, _cost_forms(described["subproblem_costs"])))
         ends = [
             (state, plan.states[0, i], plan.states[-1, i])
             for i, state in enumerate(problem.states)

@@ -11,7 +11,7 @@ from dscp_core.errors import InvalidInputError
 from dscp_ros.cli import ExitCode, entry_study_commands
 from dscp_ros.cli.arguments import print_json, print_table
 from dscp_ros.cli.options import add_computing, add_folder, add_json
-from dscp_ros.cli.output_files import complete_file, write_csv
+from dscp_ros.cli.output_files import check_folder, complete_file, write_csv
 
 if TYPE_CHECKING:
     from dscp_core.studies.terminal_time import SweepPoint, SweepSummary
@@ -98,8 +98,7 @@ def run_terminal_time(args: argparse.Namespace) -> int:
     """
     if args.quick and args.step is not None:
         raise InvalidInputError("--step", args.step, "no --step beside --quick")
-    if args.output.exists() and not args.output.is_dir():
-        raise InvalidInputError("--output", str(args.output), "a directory")
+    check_folder(args.output)
     from tqdm import tqdm
 
     from dscp_core.studies.terminal_time import Sweep, run_sweep, summarise

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import argparse
 
-from dscp_core.errors import InvalidInputError
 from dscp_ros.cli import ExitCode
 from dscp_ros.cli.arguments import overrides, print_json
 from dscp_ros.cli.options import add_computing, add_folder, add_json, add_values
+from dscp_ros.cli.output_files import check_folder
 
 DESCRIPTION = "Trains a part of the planner."
 
@@ -95,8 +95,7 @@ def run_terminal_time(args: argparse.Namespace) -> int:
     Raises:
         InvalidInputError: A value that cannot be used.
     """
-    if args.output.exists() and not args.output.is_dir():
-        raise InvalidInputError("--output", str(args.output), "a directory")
+    check_folder(args.output)
     from dscp_core import problems
     from dscp_core.learning.figures import training_figure, write_figure
     from dscp_core.learning.recipes import adjusted, recipe

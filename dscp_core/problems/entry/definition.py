@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from enum import Enum
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import casadi as ca
 
@@ -24,6 +24,7 @@ from dscp_core.problem.declaration import (
 from dscp_core.problem.extras import Extras
 from dscp_core.problems.entry.aero_table import read_aerodynamic_table
 from dscp_core.problems.entry.checks import check_parameters, check_printed, check_state
+from dscp_core.problems.entry.figure import entry_figure
 from dscp_core.problems.entry.guess import rolled_out_guess, terminal_time_guess
 from dscp_core.problems.entry.messages import MESSAGES
 from dscp_core.problems.entry.parameters import PARAMETERS
@@ -41,14 +42,8 @@ from dscp_core.problems.entry.physics import (
     heat_rate,
     load_factor,
 )
+from dscp_core.problems.entry.scene import scene_of_settings
 from dscp_core.problems.loading import ProblemFamily
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-    from dscp_core.planning.certificate import PlanCertificate
-    from dscp_core.problem.scene import Scene
-    from dscp_core.problem.trajectory import Plan
 
 NAME = "entry"
 
@@ -280,25 +275,6 @@ _PRINTED_INTERVAL_S = 27.0
 _PROXIMAL_WEIGHTS = (1e-2, 1e-4)
 
 
-def _figure(
-    plan: Plan,
-    certificate: PlanCertificate,
-    parameters: Mapping[str, Any],
-    title: str | None = None,
-) -> Figure:
-    """`entry_figure`, read when it is drawn."""
-    from dscp_core.problems.entry.figure import entry_figure
-
-    return entry_figure(plan, certificate, parameters, title)
-
-
-def _scene(plan: Plan, parameters: Mapping[str, Any], settings: Mapping[str, Any]) -> Scene:
-    """The scene, read when it is drawn."""
-    from dscp_core.problems.entry.scene import scene_of_settings
-
-    return scene_of_settings(plan, parameters, settings)
-
-
 def entry(formulation: Formulation = Formulation.QUADRATIC) -> OptimalControlProblem:
     """Smooth entry flight with a free terminal time as an optimal control problem.
 
@@ -338,7 +314,7 @@ def entry(formulation: Formulation = Formulation.QUADRATIC) -> OptimalControlPro
         ),
         control_states=(ALPHA, BANK),
         formulation=Formulation.QUADRATIC.value,
-        extras=Extras(figure=_figure, messages=MESSAGES, scene=_scene),
+        extras=Extras(figure=entry_figure, messages=MESSAGES, scene=scene_of_settings),
     )
     if formulation is Formulation.QUADRATIC:
         return _weighted(quadratic, *_PROXIMAL_WEIGHTS)

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dscp_core.errors import InvalidInputError
-from dscp_core.planning.certificate import PlanCertificate
 from dscp_core.planning.panels import (
     FLOWN,
     FLOWN_STYLE,
@@ -42,6 +41,8 @@ from dscp_core.problems.entry.physics import (
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+    from dscp_core.planning.certificate import PlanCertificate
 
 Array = NDArray[np.float64]
 

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from dscp_core.errors import InvalidInputError
 
@@ -63,11 +62,16 @@ def planet_fixed(state_names: Sequence[str], states: Array) -> PlanetFixed:
     radius, longitude, latitude, climb, heading, attack, bank = (
         states[:, names.index(name)] for name in _NAMES
     )
+    from scipy.spatial.transform import Rotation  # a fifth of a second, for drawings alone
+
     # Body to wind to local axes (north, west, up) to planet-fixed ones, each a right-handed turn:
     # pitching the nose up is a negative turn about y (left), banking right a positive one about x.
     wind_from_body = Rotation.from_euler("Y", -attack[:, np.newaxis])
     local_from_wind = Rotation.from_euler("ZYX", np.column_stack([-heading, -climb, bank]))
-    planet_from_local = _planet_from_local(longitude, latitude)
+    # At longitude and latitude zero, north is z, west is -y and up is x.
+    at_origin = Rotation.from_matrix([[0.0, 0.0, 1.0], [0.0, -1.0, 0.0], [1.0, 0.0, 0.0]])
+    turned = Rotation.from_euler("ZY", np.column_stack([longitude, -latitude]))
+    planet_from_local = turned * at_origin
     planet_from_wind = planet_from_local * local_from_wind
     up = planet_from_local.apply([0.0, 0.0, 1.0])
     return PlanetFixed(
@@ -76,10 +80,3 @@ def planet_fixed(state_names: Sequence[str], states: Array) -> PlanetFixed:
         lift=planet_from_wind.apply([0.0, 0.0, 1.0]),
         attitudes=(planet_from_wind * wind_from_body).as_quat(),
     )
-
-
-def _planet_from_local(longitude: Array, latitude: Array) -> Rotation:
-    """Rotation of local axes x north, y west, z up into planet-fixed ones."""
-    # At longitude and latitude zero, north is z, west is -y and up is x.
-    at_origin = Rotation.from_matrix([[0.0, 0.0, 1.0], [0.0, -1.0, 0.0], [1.0, 0.0, 0.0]])
-    return Rotation.from_euler("ZY", np.column_stack([longitude, -latitude])) * at_origin

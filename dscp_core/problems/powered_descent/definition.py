@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from enum import Enum
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -30,16 +30,11 @@ from dscp_core.problem.declaration import (
 )
 from dscp_core.problem.extras import Extras
 from dscp_core.problems.loading import ProblemFamily
+from dscp_core.problems.powered_descent.figure import descent_figure
 from dscp_core.problems.powered_descent.guess import norm, projected_guess, raw_guess
 from dscp_core.problems.powered_descent.messages import MESSAGES
 from dscp_core.problems.powered_descent.parameters import PARAMETERS, THRUST_PROX
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-    from dscp_core.planning.certificate import PlanCertificate
-    from dscp_core.problem.scene import Scene
-    from dscp_core.problem.trajectory import Plan
+from dscp_core.problems.powered_descent.scene import scene_of_settings
 
 NAME = "powered_descent"
 
@@ -230,25 +225,6 @@ NETWORK = Path(__file__).parent / "terminal_time.safetensors"
 """Terminal-time network of the default vehicle."""
 
 
-def _figure(
-    plan: Plan,
-    certificate: PlanCertificate,
-    parameters: Mapping[str, Any],
-    title: str | None = None,
-) -> Figure:
-    """`descent_figure`, read when it is drawn."""
-    from dscp_core.problems.powered_descent.figure import descent_figure
-
-    return descent_figure(plan, certificate, parameters, title)
-
-
-def _scene(plan: Plan, parameters: Mapping[str, Any], settings: Mapping[str, Any]) -> Scene:
-    """The scene, read when it is drawn."""
-    from dscp_core.problems.powered_descent.scene import scene_of_settings
-
-    return scene_of_settings(plan, parameters, settings)
-
-
 def powered_descent(formulation: Formulation = Formulation.CONVERGENT) -> OptimalControlProblem:
     """Fuel-optimal powered descent as an optimal control problem.
 
@@ -285,7 +261,9 @@ def powered_descent(formulation: Formulation = Formulation.CONVERGENT) -> Optima
         misses=_MISSES,
         control_states=(3, 4, 5),
         formulation=Formulation.CONVERGENT.value,
-        extras=Extras(figure=_figure, network=NETWORK, messages=MESSAGES, scene=_scene),
+        extras=Extras(
+            figure=descent_figure, network=NETWORK, messages=MESSAGES, scene=scene_of_settings
+        ),
     )
     if formulation is Formulation.CONVERGENT:
         return convergent
