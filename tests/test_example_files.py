@@ -55,7 +55,14 @@ def check_against_ipopt(problem: OptimalControlProblem, outcome: PlanOutcome) ->
     """IPOPT, which linearises nothing, finds no better trajectory around a plan."""
     plan = outcome.plan
     assert plan is not None
-    found = solve(problem, outcome.parameters, plan.states, plan.controls, plan.terminal_time_s)
+    found = solve(
+        problem,
+        outcome.parameters,
+        plan.states,
+        plan.controls,
+        plan.terminal_time_s,
+        free=problem.free_terminal_time,
+    )
     assert found.message == "Solve_Succeeded"
     assert outcome.cost == pytest.approx(found.cost, rel=1e-6)
     assert plan.terminal_time_s == pytest.approx(found.terminal_time_s, rel=1e-4)

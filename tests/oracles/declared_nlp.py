@@ -37,7 +37,7 @@ class Optimum:
 
     Attributes:
         message: IPOPT's return status.
-        cost: Trapezoidal sum of the running cost.
+        cost: Terminal cost, and the trapezoidal sum of the running cost.
         terminal_time_s: Terminal time.
         states: (N+1, nx), SI.
         controls: (N+1, nu), SI.
@@ -56,8 +56,10 @@ def solve(
     states: Array,
     controls: Array,
     terminal_time_s: float,
+    *,
+    free: bool,
 ) -> Optimum:
-    """Optimum near a start, of a problem with a running cost and constraints at the nodes.
+    """Optimum near a start, of a problem whose path constraints stand at nodes.
 
     Args:
         problem: The declaration.
@@ -65,8 +67,8 @@ def solve(
         states: (N+1, nx) to start from.
         controls: (N+1, nu) to start from.
         terminal_time_s: To start from where it is free, else to keep.
+        free: Whether it is free, within the declared bounds or else 1/100 to 100 times the start.
     """
-    assert problem.running_cost is not None
     assert not problem.cone_constraints
     p = {name: ca.SX(ca.DM(value)) for name, value in values.items()}
     count, nx, nu = len(states), len(problem.states), len(problem.controls)
@@ -74,10 +76,9 @@ def solve(
     u_scale = np.array([v.scale for v in problem.controls])
     x, u = ca.SX.sym("x", nx), ca.SX.sym("u", nu)
     flow = ca.Function("flow", [x, u], [problem.dynamics(x, u, p)])
-    running = ca.Function("running", [x, u], [problem.running_cost(x, u, p)])
+    running = problem.running_cost or (lambda _x, _u, _p: ca.SX(0))
+    along = ca.Function("running", [x, u], [running(x, u, p)])
     at = StagePoint(x, u, ca.SX(0.0))
-    rows = [c.expression(at, p) / c.scale for c in problem.path_constraints]
-    limits = ca.Function("limits", [x, u], [ca.vertcat(*rows)])
 
     scaled_x, scaled_u = ca.MX.sym("X", nx, count), ca.MX.sym("U", nu, count)
     time_s = ca.MX.sym("time")
@@ -87,7 +88,11 @@ def solve(
     defects = at_nodes[:, 1:] - at_nodes[:, :-1] - step * flow.map(count - 1)(*means)
     weights = np.ones(count)
     weights[[0, -1]] = 0.5
-    cost = step * ca.dot(running.map(count)(at_nodes, acting), ca.DM(weights).T)
+    cost = step * ca.dot(along.map(count)(at_nodes, acting), ca.DM(weights).T)
+    if problem.terminal_cost is not None:
+        time = ca.SX.sym("time")
+        end = ca.Function("end", [x, time], [problem.terminal_cost(x, time, p)])
+        cost += end(at_nodes[:, -1], time_s)
     pinned = [at_nodes[:, 0] - ca.DM(ca.evalf(problem.initial_state(p)))]
     names = [v.name for v in problem.states]
     pinned += [
@@ -95,7 +100,12 @@ def solve(
         for name, value in problem.final_state.items()
     ]
     equalities = ca.vertcat(ca.vec(defects / ca.DM(x_scale)), *pinned)
-    inequalities = ca.vec(limits.map(count)(at_nodes, acting))
+    limits = []
+    for c in problem.path_constraints:
+        limit = ca.Function("limit", [x, u], [c.expression(at, p) / c.scale])
+        nodes = slice(int(c.skip_first), count - int(c.skip_last))
+        limits.append(limit.map(nodes.stop - nodes.start)(at_nodes[:, nodes], acting[:, nodes]).T)
+    inequalities = ca.vertcat(*limits, ca.MX(0, 1))
     unknowns = ca.vertcat(time_s, ca.vec(scaled_x), ca.vec(scaled_u))
     solver = ca.nlpsol(
         "declared",
@@ -105,9 +115,10 @@ def solve(
     )
     low, high = np.full(unknowns.numel(), -np.inf), np.full(unknowns.numel(), np.inf)
     low[0] = high[0] = terminal_time_s
-    if problem.free_terminal_time:
-        assert problem.terminal_time_bounds is not None
-        low[0], high[0] = (float(bound) for bound in problem.terminal_time_bounds(p))
+    if free:
+        low[0], high[0] = terminal_time_s / 100.0, terminal_time_s * 100.0
+        if problem.terminal_time_bounds is not None:
+            low[0], high[0] = (float(bound) for bound in problem.terminal_time_bounds(p))
     answer = solver(
         x0=np.concatenate(
             [[terminal_time_s], (states / x_scale).ravel(), (controls / u_scale).ravel()]

@@ -14,7 +14,7 @@ from core.whole_runs import compare, unit
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from oracles import own_nlp
+from oracles import declared_nlp
 
 from dscp_core.errors import InvalidInputError
 from dscp_core.gradients.losses import CostLoss
@@ -134,11 +134,12 @@ def solved(problem: OptimalControlProblem, *, free: bool = False) -> tuple[Scp, 
 def assert_optimal(problem: OptimalControlProblem, *, free: bool = False) -> Scp:
     scp, result = solved(problem, free=free)
     layout, start = scp.transcription.layout, result.initial_reference
-    best = own_nlp.solve(
+    best = declared_nlp.solve(
         problem,
         problem.table.unpack(result.parameters),
         layout.states(start),
         layout.controls(start),
+        scp.transcription.terminal_time(start, result.parameters),
         free=free,
     )
     assert best.message == "Solve_Succeeded"
