@@ -74,8 +74,8 @@ def _declared(
         if value < bound.lower or value > bound.upper:
             interval = f"[{bound.lower:g}, {bound.upper:g}] {bound.unit}"
             raise InvalidInputError(message_names[name], float(value), interval)
-    if problem.check_state is not None and not np.any(np.isnan(state)):
+    if not np.any(np.isnan(state)):
         base = problem.table.pack(parameters)
         packed = problem.table.pack(problem.initial_state_values(state), base=base)
-        problem.check_state(state, problem.table.unpack(packed))
+        problem.require_start(state, packed)
     return named

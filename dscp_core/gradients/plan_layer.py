@@ -85,12 +85,9 @@ class PlanLayer(LossLayer):
     def run(self, parameters: Array, reference: Array | None) -> tuple[ScpResult | None, str]:
         """Trace of one sample, checked as `Planner.plan` checks it, or why there is none."""
         problem = self.transcription.problem
-        values = problem.table.unpack(parameters)
         try:
-            if problem.check_parameters is not None:
-                problem.check_parameters(values)
-            if problem.check_state is not None:
-                problem.check_state(parameters[positions(problem, INITIAL_STATE)], values)
+            problem.require_consistent(parameters)
+            problem.require_start(parameters[positions(problem, INITIAL_STATE)], parameters)
         except InvalidInputError as error:
             return None, str(error)
         trace, message = super().run(parameters, reference)

@@ -23,9 +23,10 @@ from dscp_core.planning.differentiation import differentiable, plan_gradient, su
 from dscp_core.planning.plan import PlanOutcome, PlanStatus, TerminalTime
 from dscp_core.planning.remainder import Remainder
 from dscp_core.planning.settings import PlannerSettings, TerminalTimePredictor
+from dscp_core.problem import checks
 from dscp_core.problem.declaration import TERMINAL_TIME, OptimalControlProblem, named
 from dscp_core.problem.parameters import Value
-from dscp_core.problem.tracing import Tracer
+from dscp_core.problem.tracing import Tracer, numeric
 from dscp_core.problem.trajectory import Plan
 from dscp_core.scp.scp import Scp, ScpStatus
 from dscp_core.transcription.transcription import Transcription
@@ -128,12 +129,20 @@ class Planner:
         return Scp(transcription, self.settings.options)
 
     def _bounds_of_time(self) -> tuple[float, float]:
-        """Least and greatest terminal time where it is free, in seconds."""
+        """Least and greatest terminal time where it is free, in seconds.
+
+        Raises:
+            InvalidInputError: They are in the wrong order, or not positive.
+        """
         if self.problem.terminal_time_bounds is None:
             return 0.0, math.inf
-        values = {n: ca.SX(v) for n, v in self.problem.table.unpack(self.parameters).items()}
-        low, high = self.problem.terminal_time_bounds(values)
-        return float(low), float(high)
+        table, what = self.problem.table, "terminal_time_bounds"
+        values = {n: ca.SX(v) for n, v in table.unpack(self.parameters).items()}
+        pair = Tracer(table).pair(what, self.problem.terminal_time_bounds, values)
+        low, high = (float(bound) for bound in pair)
+        if not 0.0 < low <= high:
+            raise InvalidInputError(what, (low, high), "0 < least <= greatest, in seconds")
+        return low, high
 
     @property
     def state_names(self) -> tuple[str, ...]:
@@ -173,8 +182,7 @@ class Planner:
             raise InvalidInputError(
                 "state", state.tolist(), f"{given.tolist()}: no initial_state_parameters hold it"
             )
-        if self.problem.check_state is not None:
-            self.problem.check_state(state, table.unpack(packed))
+        self.problem.require_start(state, packed)
         return packed
 
     def plan(
@@ -274,7 +282,8 @@ class Planner:
         yield Start(scp, packed, None, source)
         guess = self.problem.terminal_time_guess
         if free and guess is not None:
-            seconds = guess(state, self.problem.table.unpack(packed))
+            seconds = numeric("terminal_time_guess", self.problem.table, guess, packed, state)
+            checks.positive("terminal_time_guess", seconds)
             yield Start(scp, self._with_time(packed, seconds), None, source)
 
     def gradient(

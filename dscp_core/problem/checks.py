@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import fields
 from typing import Any
 
 from dscp_core.errors import InvalidInputError
@@ -23,6 +24,25 @@ def members(field: str, values: Any, kind: type) -> tuple[Any, ...]:
     return tuple(values)
 
 
+def plain(what: str, declared: Any, **kinds: type) -> None:
+    """Refuse texts, yes-or-no values and choices that are of another type.
+
+    Args:
+        what: What is declared, as messages call it; empty for the problem.
+        declared: A dataclass.
+        **kinds: Type by its name, for the fields annotated with it; ``str`` and ``bool`` are known.
+
+    Raises:
+        InvalidInputError: With the first such field.
+    """
+    known: dict[Any, type] = {"str": str, "bool": bool, **kinds}
+    for declaration in fields(declared):
+        name, kind = declaration.name, known.get(declaration.type)
+        if kind is not None and not isinstance(getattr(declared, name), kind):
+            label = f"{name} of {what}" if what else name
+            raise InvalidInputError(label, getattr(declared, name), f"of type {kind.__name__}")
+
+
 def distinct(field: str, names: Iterable[str], reserved: Sequence[str] = ()) -> None:
     """Refuse names that are empty, given twice, or reserved.
 
@@ -31,13 +51,32 @@ def distinct(field: str, names: Iterable[str], reserved: Sequence[str] = ()) -> 
     """
     seen: set[str] = set()
     for name in names:
-        if not isinstance(name, str) or not name:
-            raise InvalidInputError(f"name in {field}", name, "a name")
+        named(f"name in {field}", name)
         if name in seen:
             raise InvalidInputError(field, name, "each name once")
         if name in reserved:
             raise InvalidInputError(field, name, "a name that is not reserved")
         seen.add(name)
+
+
+def mapping(field: str, value: Any) -> None:
+    """Refuse what is no mapping.
+
+    Raises:
+        InvalidInputError: With the value.
+    """
+    if not isinstance(value, Mapping):
+        raise InvalidInputError(field, value, "a mapping of names")
+
+
+def named(field: str, name: Any) -> None:
+    """Refuse what is no name: text in one line, not blank.
+
+    Raises:
+        InvalidInputError: With the value.
+    """
+    if not (isinstance(name, str) and name.strip() and name.isprintable()):
+        raise InvalidInputError(field, name, "text in one line")
 
 
 def positive(field: str, value: Any) -> None:

@@ -21,7 +21,6 @@ from dscp_core.problem.algorithm import (
     algorithm_parameters,
 )
 from dscp_core.problem.elements import (
-    ACCEPTED_MISS,
     ConeConstraint,
     Constraint,
     CostTerm,
@@ -33,10 +32,11 @@ from dscp_core.problem.elements import (
     StagePoint,
     Variable,
     Where,
+    pinned_miss,
 )
 from dscp_core.problem.extras import Extras
 from dscp_core.problem.parameters import Parameter, ParameterTable, Value, load_parameter_file
-from dscp_core.problem.tracing import KnownParameters, called
+from dscp_core.problem.tracing import KnownParameters, numeric
 
 Symbol = TypeVar("Symbol", ca.SX, ca.MX)
 
@@ -200,6 +200,8 @@ class OptimalControlProblem:
     table: ParameterTable = field(init=False)
 
     def __post_init__(self) -> None:
+        checks.plain("", self, Quadrature=Quadrature, Extras=Extras)
+        checks.named("name", self.name)
         for label, kind in _MEMBERS.items():
             object.__setattr__(self, label, checks.members(label, getattr(self, label), kind))
         nx, nu = len(self.states), len(self.controls)
@@ -245,16 +247,17 @@ class OptimalControlProblem:
         unknown = sorted(set(self.final_state) - {s.name for s in self.states}, key=str)
         if unknown:
             raise InvalidInputError("final_state", unknown, "names of states")
-        acted_on = [index for index in self.control_states if index not in range(len(self.states))]
+        known = range(len(self.states))
+        acted_on = [i for i in self.control_states if not (isinstance(i, int) and i in known)]
         if acted_on:
-            raise InvalidInputError("control_states", acted_on, f"[0, {len(self.states) - 1}]")
+            raise InvalidInputError("control_states", acted_on, f"[0, {len(known) - 1}]")
 
     def _check_functions(self) -> None:
-        if not isinstance(self.final_state, Mapping):
-            raise InvalidInputError("final_state", self.final_state, "a mapping of names")
-        given = {name: getattr(self, name) for name in _FUNCTIONS}
-        given |= {name: getattr(self, name) for name in _OPTIONAL_FUNCTIONS}
+        for label in ("final_state", "vehicle_tables", "least_time_parameters"):
+            checks.mapping(label, getattr(self, label))
+        given = {name: getattr(self, name) for name in (*_FUNCTIONS, *_OPTIONAL_FUNCTIONS)}
         given |= {f"final_state {name}": value for name, value in self.final_state.items()}
+        given |= {f"vehicle_tables {name}": read for name, read in self.vehicle_tables.items()}
         for name, value in given.items():
             if value is not None or name not in _OPTIONAL_FUNCTIONS:
                 checks.function(name, value)
@@ -293,12 +296,18 @@ class OptimalControlProblem:
                 other.
         """
         packed = self.table.pack(values)
-        if self.check_parameters is not None:
-            expected = "a function of the parameters' values"
-            named_values = self.table.unpack(packed)
-            check = self.check_parameters
-            called("check_parameters", self.table, check, named_values, expected=expected)
+        self.require_consistent(packed)
         return packed
+
+    def require_consistent(self, packed: NDArray[np.float64]) -> None:
+        """Raise `InvalidInputError` for packed parameters that contradict each other."""
+        if self.check_parameters is not None:
+            numeric("check_parameters", self.table, self.check_parameters, packed)
+
+    def require_start(self, state: NDArray[np.float64], packed: NDArray[np.float64]) -> None:
+        """Raise `InvalidInputError` for a state (nx,), SI, that no plan can start from."""
+        if self.check_state is not None:
+            numeric("check_state", self.table, self.check_state, packed, state)
 
     def read_vehicle(self, path: str | Path) -> dict[str, Value]:
         """Values of a vehicle file, those of the tables that it points to included.
@@ -337,7 +346,7 @@ class OptimalControlProblem:
         if self.misses:
             return self.misses
         return tuple(
-            _miss(index, state, self.final_state[state.name])
+            pinned_miss(index, state, self.final_state[state.name])
             for index, state in enumerate(self.states)
             if state.name in self.final_state
         )
@@ -364,6 +373,7 @@ _MEMBERS: Mapping[str, type] = {
     "path_constraints": PathConstraint,
     "cone_constraints": ConeConstraint,
     "misses": Miss,
+    "initial_state_parameters": str,
 }
 _POSITIVE = ("cost_scale", "cost_tolerance", "defect_tolerance", "virtual_control_tolerance")
 _FUNCTIONS = ("dynamics", "initial_state", "initial_guess")
@@ -375,15 +385,6 @@ _OPTIONAL_FUNCTIONS = (
     "check_state",
     "terminal_time_guess",
 )
-
-
-def _miss(index: int, state: Variable, final: Callable[[Parameters], ca.SX]) -> Miss:
-    return Miss(
-        f"miss_{state.name}",
-        lambda x, p: ca.fabs(x[index] - final(p)),
-        state.unit,
-        ACCEPTED_MISS * state.scale,
-    )
 
 
 def _restored(pickled: bytes, count: int, expressions: str) -> OptimalControlProblem:

@@ -34,6 +34,8 @@ class Variable:
     description: str
 
     def __post_init__(self) -> None:
+        checks.named("name of a variable", self.name)
+        checks.plain(self.name, self)
         checks.positive(f"scale of {self.name}", self.scale)
 
 
@@ -121,6 +123,8 @@ class Constraint:
     tolerance: float | Callable[[Mapping[str, Any]], float] | None = None
 
     def __post_init__(self) -> None:
+        checks.named("name of a constraint", self.name)
+        checks.plain(f"constraint {self.name}", self, Where=Where)
         checks.positive(f"scale of constraint {self.name}", self.scale)
         checks.function(f"constraint {self.name}", self.expression)
         if self.tolerance is not None and not callable(self.tolerance):
@@ -184,8 +188,20 @@ class Miss:
     tolerance: float
 
     def __post_init__(self) -> None:
+        checks.named("name of a miss", self.name)
+        checks.plain(f"miss {self.name}", self)
         checks.function(f"miss {self.name}", self.expression)
         checks.not_negative(f"tolerance of miss {self.name}", self.tolerance)
+
+
+def pinned_miss(index: int, state: Variable, final: Callable[[Parameters], ca.SX]) -> Miss:
+    """How far a pinned state is off."""
+    return Miss(
+        f"miss_{state.name}",
+        lambda x, p: ca.fabs(x[index] - final(p)),
+        state.unit,
+        ACCEPTED_MISS * state.scale,
+    )
 
 
 @dataclass(frozen=True)
@@ -216,6 +232,8 @@ class CostTerm:
     where: Where = Where.MEAN
 
     def __post_init__(self) -> None:
+        checks.named("name of a cost term", self.name)
+        checks.plain(f"cost term {self.name}", self, Where=Where)
         checks.function(f"cost term {self.name}", self.expression)
 
 

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
+from dscp_core.problem import checks
 from dscp_core.problem.messages import Messages
 from dscp_core.problem.scene import SceneOf
 from dscp_core.problem.trajectory import Plan
@@ -64,3 +65,9 @@ class Extras:
     network: Path | None = None
     messages: Messages = field(default_factory=Messages)
     scene: SceneOf | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("figure", "scene"):
+            if getattr(self, name) is not None:
+                checks.function(f"{name} of extras", getattr(self, name))
+        checks.plain("extras", self, Messages=Messages)

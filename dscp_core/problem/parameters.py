@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dscp_core.errors import InvalidInputError
+from dscp_core.problem import checks
 
 Value = float | Sequence[float] | NDArray[np.float64]
 
@@ -48,6 +49,13 @@ class Parameter:
     source: str = ""
     fixes_optimum: bool = True
     infinite: bool = False
+
+    def __post_init__(self) -> None:
+        checks.named("name of a parameter", self.name)
+        checks.plain(f"parameter {self.name}", self)
+        if not self.lower <= self.upper:
+            bound = f"at most upper, {self.upper}"
+            raise InvalidInputError(f"lower of parameter {self.name}", self.lower, bound)
 
     @property
     def size(self) -> int:

@@ -10,6 +10,7 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 
 from dscp_core.errors import InvalidInputError
 from dscp_core.problem.parameters import ParameterTable
@@ -115,12 +116,37 @@ def called(
         return function(*arguments)
     except InvalidInputError:
         raise
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise _refusal(what, table, error, expected) from error
 
 
+def numeric(
+    what: str,
+    table: ParameterTable,
+    function: Callable[..., Any],
+    packed: NDArray[np.float64],
+    state: NDArray[np.float64] | None = None,
+) -> Any:
+    """Result of a function of a declaration that takes numbers.
+
+    Args:
+        what: The function, as messages call it.
+        table: Parameters of the problem.
+        function: Of the state, where there is one, and the parameters' values by name.
+        packed: Packed parameters, SI.
+        state: (nx,), SI, or None.
+
+    Raises:
+        InvalidInputError: It raises; the message names it, and the place in its file.
+    """
+    values = KnownParameters(table.unpack(packed))
+    arguments = (values,) if state is None else (state, values)
+    expected = "a function of the parameters' values"
+    return called(what, table, function, *arguments, expected=expected)
+
+
 def _refusal(
-    what: str, table: ParameterTable, error: Exception, expected: str
+    what: str, table: ParameterTable, error: BaseException, expected: str
 ) -> InvalidInputError:
     place = _place(error)
     if isinstance(error, UnknownParameterError):
@@ -130,7 +156,7 @@ def _refusal(
     return InvalidInputError(what, message + place, expected)
 
 
-def _place(error: Exception) -> str:
+def _place(error: BaseException) -> str:
     """File and line of the innermost frame that is neither CasADi's nor this package's."""
     own = (f"{os.sep}casadi{os.sep}", f"{Path(__file__).parent}{os.sep}")
     frames = [

@@ -115,5 +115,4 @@ def _check(problem: OptimalControlProblem, base: Array, sample: Sample) -> None:
     if sample.terminal_time_s is not None:
         changed[TERMINAL_TIME] = np.array([sample.terminal_time_s])
     packed = table.pack(changed, base=base)
-    if problem.check_state is not None:
-        problem.check_state(state, table.unpack(packed))
+    problem.require_start(state, packed)

@@ -19,6 +19,7 @@ from dscp_core.problem.declaration import (
     PathConstraint,
     Variable,
 )
+from dscp_core.problem.extras import Extras
 from dscp_core.problem.parameters import Parameter
 
 CART = cart()
@@ -53,6 +54,27 @@ def test_scales_are_positive_numbers(scale: Any) -> None:
         assert caught.value.value is scale
 
 
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Variable("", "m", 1.0, ""), "name of a variable: got ''"),
+        (lambda: Variable(3, "m", 1.0, ""), "name of a variable: got 3"),  # type: ignore[arg-type]
+        (lambda: Variable("x", None, 1.0, ""), "unit of x: got None"),  # type: ignore[arg-type]
+        (lambda: Parameter("mass", 1.0, 3, ""), "unit of parameter mass"),  # type: ignore[arg-type]
+        (lambda: Parameter("mass", 1.0, "kg", "", 2.0, 0.0), "lower of parameter mass: got 2.0"),
+        (lambda: limit(where="node"), "where of constraint limit: got 'node', expected of type W"),
+        (lambda: limit(skip_first="no"), "skip_first of constraint limit: got 'no'"),
+        (lambda: CostTerm("drag", term("t").expression, "node"), "where of cost term drag"),  # type: ignore[arg-type]
+        (lambda: Miss("m\tm", lambda x, p: x[0], "m", 1.0), r"name of a miss: got 'm\\tm'"),
+        (lambda: Extras(figure=3), "figure of extras: got 3, expected a function"),  # type: ignore[arg-type]
+        (lambda: Extras(messages=3), "messages of extras: got 3, expected of"),  # type: ignore[arg-type]
+    ],
+)
+def test_parts_of_another_type_are_refused(make: Callable[[], Any], message: str) -> None:
+    with pytest.raises(InvalidInputError, match=message):
+        make()
+
+
 def test_tolerances_are_not_negative() -> None:
     with pytest.raises(InvalidInputError, match=r"tolerance of constraint force: got -1"):
         limit("force", tolerance=-1.0)
@@ -66,7 +88,6 @@ def test_tolerances_are_not_negative() -> None:
     [
         ({"states": (CART.states[0],) * 2}, "states and controls: got 'position'"),
         ({"controls": (Variable("speed", "m", 1.0, ""),)}, "states and controls: got 'speed'"),
-        ({"states": (Variable("", "m", 1.0, ""),)}, "name in states and controls: got ''"),
         ({"parameters": (*CART.parameters, CART.parameters[3])}, r"parameters: got \['mass'\]"),
         (
             {"parameters": parameters(Parameter("trust_region_state", 1.0, "1", ""))},
@@ -120,6 +141,18 @@ def test_tolerances_are_not_negative() -> None:
         ({"initial_state_parameters": ("begin",)}, "got 'begin', expected a known name"),
         ({"least_time_parameters": {"weight": 1.0}}, "got 'weight', expected a known name"),
         ({"control_states": (2,)}, r"control_states: got \[2\], expected \[0, 1\]"),
+        ({"control_states": (1.0,)}, r"control_states: got \[1.0\], expected \[0, 1\]"),
+        ({"initial_state_parameters": "start"}, "got 'start', expected a tuple of str"),
+        ({"name": ""}, "name: got '', expected text in one line"),
+        ({"name": "two\nlines"}, r"name: got 'two\\nlines', expected text in one line"),
+        ({"name": None}, "name: got None, expected of type str"),
+        ({"cost_unit": None}, "cost_unit: got None, expected of type str"),
+        ({"quadrature": "trapezoid"}, "quadrature: got 'trapezoid', expected of type Quadrature"),
+        ({"free_terminal_time": "no"}, "free_terminal_time: got 'no', expected of type bool"),
+        ({"extras": 3}, "extras: got 3, expected of type Extras"),
+        ({"vehicle_tables": 3}, "vehicle_tables: got 3, expected a mapping"),
+        ({"vehicle_tables": {"table": 3}}, "vehicle_tables table: got 3, expected a function"),
+        ({"least_time_parameters": ["mass"]}, "least_time_parameters: got .*, expected a mapping"),
         ({"cost_scale": 0.0}, "cost_scale: got 0.0, expected > 0"),
         ({"cost_magnitude": -1.0}, "cost_magnitude: got -1.0, expected > 0"),
         ({"cost_tolerance": math.inf}, "cost_tolerance: got inf, expected > 0"),
