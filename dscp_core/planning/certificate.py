@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 
 import casadi as ca
@@ -18,6 +18,7 @@ import scipy.integrate
 from numpy.typing import NDArray
 
 from dscp_core.errors import InvalidInputError
+from dscp_core.problem.checks import not_negative
 from dscp_core.problem.declaration import (
     Constraint,
     OptimalControlProblem,
@@ -56,7 +57,7 @@ class Check:
         bound: Largest accepted value.
         unit: Unit of both.
         time_s: When the worst value occurs, seconds from the start.
-        passed: Whether worst_value <= bound.
+        passed: Whether worst_value <= bound, and for a miss, which is a distance, >= 0.
     """
 
     name: str
@@ -153,16 +154,19 @@ class PlanVerifier:
         rates = trace("dynamics", problem.dynamics, state, u, parameters, rows=nx)
         scaled_rates = rates / ca.DM(self._scale)
         self._rates = CompiledFunction("rates", [x, u, packed], [scaled_rates])
-        self._checked = tuple(constraints(problem, Where.NODE))
-        point = StagePoint(x, u, ca.SX(0.0))
+        # Along the flight there is no difference between nodes and interval means.
+        self._checked = tuple(c for where in Where for c in constraints(problem, where))
+        step = ca.SX.sym("T")
+        point = StagePoint(x, u, step)
+        trace = Tracer(problem.table, x, u, step, packed)
         limits = ca.Function(
             "limits",
-            [x, u, packed],
+            [x, u, ca.vertcat(step, packed)],
             [_stack(_violation(c, trace, point, parameters) for c in self._checked)],
         )
         self._points = intervals * substeps + 1
         grid = [ca.MX.sym("x", nx, self._points), ca.MX.sym("u", nu, self._points)]
-        grid.append(ca.MX.sym("p", problem.table.size))
+        grid.append(ca.MX.sym("T_p", 1 + problem.table.size))
         mapped = limits.map("limits_on_grid", "serial", self._points, [2], [])
         self._limits = CompiledFunction("limits_on_grid", grid, [mapped(*grid)])
         self._misses = CompiledFunction(
@@ -201,27 +205,22 @@ class PlanVerifier:
         if failure is None:
             missed = self._misses(flown[-1], parameters)[0]
             for miss, value in zip(self._problem.end_checks, missed, strict=True):
-                checks.append(_check(miss.name, value, miss.tolerance, miss.unit, times[-1]))
-        values = self._limits_along(flown, applied, parameters)
-        named_values = self._problem.table.unpack(parameters)
+                check = _check(miss.name, value, miss.tolerance, miss.unit, times[-1])
+                checks.append(replace(check, passed=check.passed and check.worst_value >= 0.0))
+        step = float(times_s[-1] - times_s[0]) / self._intervals
+        values = self._limits_along(flown, applied, step, parameters)
+        table = self._problem.table
         for column, constraint in enumerate(self._checked):
             worst = int(np.argmax(values[:, column]))
             if np.isneginf(values[worst, column]):
                 continue  # its bound is infinite: it is not imposed
+            bound = constraint.accepted(table, parameters)
+            not_negative(f"tolerance of constraint {constraint.name}", bound)
+            worst_value = values[worst, column]
             checks.append(
-                _check(
-                    constraint.name,
-                    values[worst, column],
-                    constraint.accepted(named_values),
-                    constraint.unit,
-                    times[worst],
-                )
+                _check(constraint.name, worst_value, bound, constraint.unit, times[worst])
             )
-        reasons = [
-            f"{c.name} {c.worst_value:.4g} {c.unit} at {c.time_s:.2f} s exceeds {c.bound:.4g}"
-            for c in checks
-            if not c.passed
-        ]
+        reasons = [_reason(check) for check in checks if not check.passed]
         if failure is not None:
             reasons.insert(0, failure)
         names = [s.name for s in self._problem.states]
@@ -239,11 +238,17 @@ class PlanVerifier:
             mass_used_kg=used,
         )
 
-    def _limits_along(self, flown: Array, applied: Array, parameters: Array) -> Array:
+    def require_tolerances(self, parameters: Array) -> None:
+        """Raise `InvalidInputError` for a tolerance that packed parameters, SI, make no number."""
+        for constraint in self._checked:
+            constraint.accepted(self._problem.table, parameters)
+
+    def _limits_along(self, flown: Array, applied: Array, step: float, parameters: Array) -> Array:
         """Violation of every constraint at every point, (M, constraints)."""
         # A flight that ended early is filled up with its last point.
         index = np.minimum(np.arange(self._points), len(flown) - 1)
-        violations = self._limits(flown[index].ravel(), applied[index].ravel(), parameters)[0]
+        known = np.append(step, parameters)
+        violations = self._limits(flown[index].ravel(), applied[index].ravel(), known)[0]
         return violations.reshape(self._points, -1)[: len(flown)]
 
     def _fly(
@@ -307,6 +312,13 @@ def _violation(
     if linear:
         return value
     return ca.norm_2(value[1:]) - value[0]
+
+
+def _reason(failed: Check) -> str:
+    text = f"{failed.name} {failed.worst_value:.4g} {failed.unit} at {failed.time_s:.2f} s"
+    if failed.worst_value <= failed.bound:
+        return f"{text} is negative, so no distance from the target"
+    return f"{text} exceeds {failed.bound:.4g}"
 
 
 def _check(name: str, value: float, bound: float, unit: str, time_s: float) -> Check:

@@ -125,5 +125,5 @@ def function(field: str, value: Any) -> None:
 def _is_number(value: Any) -> bool:
     try:
         return not isinstance(value, str | bool) and math.isfinite(value)
-    except TypeError:
+    except (TypeError, RuntimeError):  # the latter is CasADi's
         return False

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import Enum
 from typing import Any
 
 import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
 
 from dscp_core.problem import checks
+from dscp_core.problem.parameters import ParameterTable
+from dscp_core.problem.tracing import numeric
 
 
 @dataclass(frozen=True)
@@ -130,11 +135,21 @@ class Constraint:
         if self.tolerance is not None and not callable(self.tolerance):
             checks.not_negative(f"tolerance of constraint {self.name}", self.tolerance)
 
-    def accepted(self, values: Mapping[str, Any]) -> float:
-        """The tolerance for a vehicle's values by name."""
+    def accepted(self, table: ParameterTable, packed: NDArray[np.float64]) -> float:
+        """The tolerance for packed parameters; infinite only where the function says so.
+
+        Raises:
+            InvalidInputError: The function raises, or returns no number from zero.
+        """
         if self.tolerance is None:
             return ACCEPTED_VIOLATION * self.scale
-        return self.tolerance(values) if callable(self.tolerance) else self.tolerance
+        if not callable(self.tolerance):
+            return self.tolerance
+        what = f"tolerance of constraint {self.name}"
+        value = numeric(what, table, self.tolerance, packed)
+        if not (isinstance(value, float) and value == math.inf):
+            checks.not_negative(what, value)
+        return float(value)
 
 
 class PathConstraint(Constraint):

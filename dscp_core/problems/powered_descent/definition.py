@@ -187,7 +187,12 @@ _THRUST_FLOOR = PathConstraint(
 # The midpoint rule burns |mean thrust|: alternating nodal directions would otherwise fly on less
 # than thrust_min.
 _MEAN_THRUST_FLOOR = PathConstraint(
-    "mean_thrust_min", _mean_thrust_floor, _THRUST_N, "N", where=Where.MEAN
+    "mean_thrust_min",
+    _mean_thrust_floor,
+    _THRUST_N,
+    "N",
+    where=Where.MEAN,
+    tolerance=_thrust_tolerance_n,
 )
 _LINEARISED_THRUST_CEILING = PathConstraint(
     "thrust_max", _thrust_ceiling, _THRUST_N, "N", tolerance=_thrust_tolerance_n

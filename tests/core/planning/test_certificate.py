@@ -90,6 +90,7 @@ def test_good_plan_passes(plan: Solved, verifier: PlanVerifier) -> None:
         "thrust_max",
         "pointing",
         "glideslope",
+        "mean_thrust_min",
     ]
     assert all(c.passed for c in certificate.checks)
     # The midpoint rule's error at N = 50 is 0.12 m with the means held.

@@ -80,7 +80,8 @@ def test_tolerances_are_not_negative() -> None:
         limit("force", tolerance=-1.0)
     with pytest.raises(InvalidInputError, match=r"tolerance of miss distance: got nan"):
         Miss("distance", lambda x, p: x[0], "m", math.nan)
-    assert limit(tolerance=lambda values: values["mass"]).accepted({"mass": 3.0}) == 3.0
+    grows = limit(tolerance=lambda values: values["mass"])
+    assert grows.accepted(CART.table, CART.pack({"mass": 3.0})) == 3.0
 
 
 @pytest.mark.parametrize(
