@@ -114,9 +114,9 @@ def called(
     """
     try:
         return function(*arguments)
-    except InvalidInputError:
+    except (InvalidInputError, KeyboardInterrupt):
         raise
-    except (Exception, SystemExit) as error:
+    except BaseException as error:
         raise _refusal(what, table, error, expected) from error
 
 

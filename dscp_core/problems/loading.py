@@ -64,7 +64,9 @@ def from_entry_point(name: str) -> Any:
         raise InvalidInputError("problem", name, f"offered once; installed packages have {offered}")
     try:
         return point.load()
-    except (Exception, SystemExit) as error:
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:
         raise InvalidInputError(
             "problem", name, f"an entry point that can be loaded: {_told(error)}"
         ) from error
@@ -110,9 +112,9 @@ def family_of(text: str, found: Any) -> ProblemFamily:
 def _made(text: str, function: Callable[[], Any]) -> OptimalControlProblem:
     try:
         made = function()
-    except DscpError:
+    except (DscpError, KeyboardInterrupt):
         raise
-    except (Exception, SystemExit) as error:
+    except BaseException as error:
         raise InvalidInputError(
             "problem", text, f"a function that makes a problem: {_told(error)}"
         ) from error
@@ -142,9 +144,9 @@ def _module(path: Path, text: str) -> ModuleType:
         sys.path.append(folder)
     try:
         exec(compile(content, path, "exec", dont_inherit=True), module.__dict__)
-    except (Exception, SystemExit) as error:
+    except BaseException as error:
         del sys.modules[name]
-        if isinstance(error, DscpError):
+        if isinstance(error, DscpError | KeyboardInterrupt):
             raise
         raise InvalidInputError(
             "problem", text, f"a Python file that can be run: {_told(error)}"
@@ -188,8 +190,9 @@ def _may_be_problem(value: Any) -> bool:
 def _told(error: BaseException) -> str:
     """What an error says, and where outside of this file it came from."""
     if isinstance(error, SyntaxError):
-        return f"{Path(error.filename or '').name} line {error.lineno}: {error.msg}"
+        place = f"{Path(error.filename).name} line {error.lineno}: " if error.filename else ""
+        return f"{place}{error.msg}"
     frames = [f for f in traceback.extract_tb(error.__traceback__) if f.filename != __file__]
     own = [frame for frame in frames if not frame.filename.startswith("<frozen ")]
     place = f"{Path(own[0].filename).name} line {own[0].lineno}: " if own else ""
-    return f"{place}{type(error).__name__}: {error}"
+    return f"{place}{type(error).__name__}: {' '.join(str(error).split())}"

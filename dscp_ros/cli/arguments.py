@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import math
 from collections.abc import Mapping, Sequence
 from enum import Enum
@@ -11,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from dscp_core.errors import InvalidInputError
 from dscp_ros.cli.options import add_values
+from dscp_ros.cli.results import print_document
 
 if TYPE_CHECKING:
     from dscp_core.planning.planner import Planner
@@ -173,7 +173,7 @@ def print_table(header: Sequence[str], rows: Sequence[Sequence[str]], indent: st
 
 def print_json(value: Any) -> None:
     """Prints strict JSON: null stands for numbers that are not finite."""
-    print(json.dumps(json_ready(value), allow_nan=False))
+    print_document(json_ready(value), allow_nan=False)
 
 
 def json_ready(value: Any) -> Any:

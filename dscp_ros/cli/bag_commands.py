@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 
 from dscp_ros.cli import ExitCode
+from dscp_ros.cli.results import print_document
 
 DESCRIPTION = """\
 Works on ROS 2 bags in the MCAP format: a bag directory, with or without metadata.yaml, or a single
@@ -128,4 +128,7 @@ def run_record(args: argparse.Namespace) -> int:
 
 
 def _print(as_json: bool, content: object, lines: list[str]) -> None:
-    print(json.dumps(content) if as_json else "\n".join(lines))
+    if as_json:
+        print_document(content)
+    else:
+        print("\n".join(lines))

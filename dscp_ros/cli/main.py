@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import os
 import sys
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from importlib import import_module
 from typing import Any, NamedTuple, NoReturn
 
 from dscp_core.errors import DscpError, InvalidInputError
 from dscp_ros.cli import ExitCode
+from dscp_ros.cli.results import print_document, results_only
 
 
 class Command(NamedTuple):
@@ -177,7 +178,8 @@ def _run(arguments: list[str]) -> int:
     try:
         args = build_parser(command).parse_args(arguments)
         run: Callable[[argparse.Namespace], int] = args.run
-        return run(args)
+        with results_only() if as_json else nullcontext():
+            return run(args)
     except ModuleNotFoundError as error:
         extra = extra_of(error.name or "")
         if extra is None:
@@ -202,7 +204,7 @@ def _report(error: DscpError, as_json: bool) -> int:
                 "value": _json_value(error.value),
                 "bound": error.bound,
             }
-        print(json.dumps({"error": description}))
+        print_document({"error": description})
     return ExitCode.BAD_INPUT
 
 

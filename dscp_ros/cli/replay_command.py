@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from dscp_ros.cli.results import print_document
 from dscp_ros.replay.options import (
     DEFAULT_CLOCK_HZ,
     DEFAULT_WAIT_S,
@@ -173,7 +173,7 @@ def run(args: argparse.Namespace) -> int:
         say=lambda line: print(f"dscp replay: {line}", file=sys.stderr),
     )
     if args.json:
-        print(json.dumps({"bag": str(options.bag), **result.to_dict(), "report": report.to_dict()}))
+        print_document({"bag": str(options.bag), **result.to_dict(), "report": report.to_dict()})
     else:
         _print(result, report)
     return 0
