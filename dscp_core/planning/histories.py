@@ -6,6 +6,7 @@ Matplotlib is imported when it is drawn.
 from __future__ import annotations
 
 import math
+import textwrap
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -26,6 +27,7 @@ from dscp_core.problem.declaration import OptimalControlProblem, StagePoint, Whe
 from dscp_core.problem.trajectory import Plan
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 Array = NDArray[np.float64]
@@ -33,6 +35,9 @@ Array = NDArray[np.float64]
 _COLUMNS = 3
 _MOST_PANELS = 24
 _PANEL_INCHES = (4.5, 3.2)
+_LEGEND_INCHES, _LETTERS_PER_INCH = 3.8, 10
+_LONGEST_NAME = 34
+_LEAST_SPAN = 1e-3  # of the scale, from bottom to top of a panel
 
 
 def plan_figure(
@@ -61,9 +66,13 @@ def plan_figure(
     columns = min(_COLUMNS, len(variables))
     rows = math.ceil(len(variables) / columns)
     width, height = _PANEL_INCHES
-    figure = new_figure(
-        (columns * width, rows * height + 0.8), title or _headline(problem, plan, certificate)
+    headline = textwrap.fill(
+        title or _headline(problem, plan, certificate),
+        int((columns * width - _LEGEND_INCHES) * _LETTERS_PER_INCH),
     )
+    lines = headline.count("\n")
+    size = (columns * width, rows * height + 0.8 + 0.2 * lines)
+    figure = new_figure(size, headline)
     bounds = box_bounds(problem, parameters)
     planned = np.hstack([plan.controls, plan.states])
     flown = np.hstack([certificate.controls, certificate.states])
@@ -77,13 +86,14 @@ def plan_figure(
             certificate,
             planned[:, number],
             flown[:, number],
-            f"{variable.name.replace('_', ' ')}{unit}",
+            f"{_cut(variable.name.replace('_', ' '))}{unit}",
             stepped=number < len(problem.controls),
         )
         if variable.name in pinned:
             axes.plot(
                 plan.terminal_time_s, pinned[variable.name], "x", color=PLANNED, clip_on=False
             )
+        _keep_rounding_small(axes, _LEAST_SPAN * variable.scale)
         low, high = bounds.get(variable.name, (-math.inf, math.inf))
         if math.isfinite(low):
             draw_limit(axes, low, "least", above=False)
@@ -108,16 +118,17 @@ def box_bounds(
     nx = len(problem.states)
     at = ca.SX.sym("at", len(names))
     packed = ca.SX.sym("p", problem.table.size)
-    point = StagePoint(at[:nx], at[nx:], ca.SX(0.0))
+    step = ca.SX.sym("T")
+    point = StagePoint(at[:nx], at[nx:], step)
     values = problem.table.pack({n: parameters[n] for n in problem.table.names})
     bounds = dict.fromkeys(names, (-math.inf, math.inf))
     for constraint in problem.path_constraints:
         if constraint.where is not Where.NODE:
             continue
-        expression = constraint.expression(point, named(problem, packed))
+        expression = ca.SX(constraint.expression(point, named(problem, packed)))
         slopes = ca.jacobian(expression, at)
         touched = set(slopes.sparsity().get_triplet()[1])
-        if len(touched) != 1 or ca.depends_on(slopes, at):
+        if len(touched) != 1 or ca.depends_on(slopes, at) or ca.depends_on(expression, step):
             continue
         (index,) = touched
         both = ca.Function("box", [at, packed], [expression, slopes[index]])
@@ -134,6 +145,17 @@ def _pinned(problem: OptimalControlProblem, parameters: Mapping[str, Any]) -> di
     """Final values of the states that have one."""
     values = {name: ca.SX(value) for name, value in parameters.items()}
     return {name: float(value(values)) for name, value in problem.final_state.items()}
+
+
+def _cut(name: str) -> str:
+    return name if len(name) <= _LONGEST_NAME else f"{name[: _LONGEST_NAME - 3]}..."
+
+
+def _keep_rounding_small(axes: Axes, span: float) -> None:
+    """Widen a panel of next to nothing, so that rounding does not look like a difference."""
+    low, high = axes.get_ylim()
+    if high - low < span:
+        axes.set_ylim((low + high - span) / 2, (low + high + span) / 2)
 
 
 def _headline(problem: OptimalControlProblem, plan: Plan, certificate: PlanCertificate) -> str:
