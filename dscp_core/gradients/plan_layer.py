@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 
 from dscp_core.errors import InvalidInputError
-from dscp_core.gradients.gradient import INITIAL_STATE, Gradient, Method, positions
+from dscp_core.gradients.gradient import Gradient, Method
 from dscp_core.gradients.losses import Loss
 from dscp_core.gradients.run import of_plan, settle
 from dscp_core.gradients.torch_layer import LossLayer, SampleReport
@@ -87,7 +87,7 @@ class PlanLayer(LossLayer):
         problem = self.transcription.problem
         try:
             problem.require_consistent(parameters)
-            problem.require_start(parameters[positions(problem, INITIAL_STATE)], parameters)
+            problem.require_start(self.transcription.initial_state(parameters), parameters)
         except InvalidInputError as error:
             return None, str(error)
         trace, message = super().run(parameters, reference)

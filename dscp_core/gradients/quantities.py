@@ -51,6 +51,8 @@ def quantity(problem: OptimalControlProblem, of: str | Loss) -> Quantity:
         factor = "" if of.factor == 1.0 else f"{of.factor:g} * "
         return replace(found, name=factor + found.name, symbol=factor + found.symbol, loss=of)
     if not isinstance(of, str):
+        if isinstance(of, type) or not callable(getattr(of, "gradient", None)):
+            raise InvalidInputError("quantity", of, "a name or a loss")
         return Quantity(type(of).__name__, of, "L", "")
     for state in problem.states:
         if of in (FINAL + state.name, state.name):

@@ -183,11 +183,15 @@ class DscpLayer(torch.nn.Module, ABC):
     def _packed(self, inputs: Mapping[str, torch.Tensor]) -> torch.Tensor:
         if set(inputs) != set(self._positions):
             raise InvalidInputError("inputs", sorted(inputs), f"exactly {sorted(self._positions)}")
+        for name, tensor in inputs.items():
+            if not isinstance(tensor, torch.Tensor) or tensor.is_complex():
+                raise InvalidInputError(name, tensor, "a tensor of real numbers")
         first = next(iter(inputs.values()))
-        batch = first.shape[0] if first.dim() else 0
+        batch = first.shape[0] if first.dim() else 1
         packed = self._base.expand(batch, -1)
         for name, where in self._positions.items():
-            tensor = inputs[name][:, None] if inputs[name].dim() == 1 else inputs[name]
+            flat = where.size == 1 and inputs[name].dim() == 1
+            tensor = inputs[name][:, None] if flat else inputs[name]
             matrix = _matrix(name, tensor, (batch, where.size))
             packed = packed.index_copy(1, torch.from_numpy(where), matrix)
         return packed

@@ -24,7 +24,7 @@ from dscp_core.planning.plan import PlanOutcome, PlanStatus, TerminalTime
 from dscp_core.planning.remainder import Remainder
 from dscp_core.planning.settings import PlannerSettings, TerminalTimePredictor
 from dscp_core.problem import checks
-from dscp_core.problem.declaration import TERMINAL_TIME, OptimalControlProblem, named
+from dscp_core.problem.declaration import TERMINAL_TIME, OptimalControlProblem
 from dscp_core.problem.parameters import Value
 from dscp_core.problem.tracing import Tracer, numeric
 from dscp_core.problem.trajectory import Plan
@@ -110,14 +110,6 @@ class Planner:
         self._verifier.require_tolerances(self.parameters)
         self._time = self.problem.table.slice(TERMINAL_TIME)
         self._time_bounds = self._bounds_of_time()
-        packed = ca.SX.sym("p", self.problem.table.size)
-        start = Tracer(self.problem.table, packed)(
-            "initial_state",
-            self.problem.initial_state,
-            named(self.problem, packed),
-            rows=len(self.problem.states),
-        )
-        self._start = ca.Function("initial_state", [packed], [start])
 
     def __reduce__(self) -> tuple[Any, ...]:
         """By what it was made of; the copy compiles its own functions."""
@@ -153,12 +145,9 @@ class Planner:
     @property
     def initial_state(self) -> Array:
         """Initial state of the settings' parameters, (nx,), SI."""
-        return self._initial_state(self.parameters)
+        return self.transcription.initial_state(self.parameters)
 
-    def _initial_state(self, packed: Array) -> Array:
-        return np.asarray(self._start(packed), dtype=np.float64).ravel()
-
-    def check_state(self, state: Array) -> Array:
+    def check_state(self, state: Array | Sequence[float]) -> Array:
         """Packed parameters with this initial state.
 
         Args:
@@ -168,7 +157,10 @@ class Planner:
             InvalidInputError: Wrong length, not finite, out of bounds, refused by the problem, or
                 another than the problem's own where no parameters hold it.
         """
-        state = np.asarray(state, dtype=np.float64)
+        try:
+            state = np.asarray(state, dtype=np.float64)
+        except (TypeError, ValueError):
+            raise InvalidInputError("state", state, "numbers") from None
         if state.shape != (len(self.problem.states),):
             raise InvalidInputError(
                 "state", f"shape {state.shape}", f"shape ({len(self.problem.states)},)"
@@ -178,7 +170,7 @@ class Planner:
                 raise InvalidInputError(name, float(value), "finite")
         table = self.problem.table
         packed = table.pack(self.problem.initial_state_values(state), base=self.parameters)
-        given = self._initial_state(packed)
+        given = self.transcription.initial_state(packed)
         if np.any(np.abs(given - state) > 1e-9 * self.transcription.layout.state_scale):
             raise InvalidInputError(
                 "state", state.tolist(), f"{given.tolist()}: no initial_state_parameters hold it"
@@ -207,13 +199,14 @@ class Planner:
             warm_start: A plan of the same vehicle to start from, if the state is near it.
             elapsed_s: Flight time between that plan's start and this state.
         """
-        state = self.initial_state if state is None else np.asarray(state, dtype=np.float64)
+        state = self.initial_state if state is None else state
         attempt = Attempt(self.problem, self._verifier, time.perf_counter(), deadline_s)
         source = self.settings.terminal_time
         try:
             packed = self.check_state(state)
         except InvalidInputError as error:
             return attempt.invalid(str(error), self.parameters, source)
+        state = np.asarray(state, dtype=np.float64)
         layout = self.transcription.layout
         left = Remainder.of(warm_start, self.problem.name, elapsed_s, state, layout)
         if self._predictor is not None:
@@ -310,10 +303,12 @@ class Planner:
 
         Raises:
             DifferentiationError: There is no plan, or its run has no gradient.
-            InvalidInputError: A plan of another problem or with other intervals, an unknown
-                quantity, or one that the method cannot differentiate.
+            InvalidInputError: A plan of another problem or with other intervals, no outcome, an
+                unknown quantity, or one that the method cannot differentiate.
         """
         outcome = self.plan() if at is None else at
+        if not isinstance(outcome, PlanOutcome):
+            raise InvalidInputError("at", f"a {type(outcome).__name__}", "an outcome of plan()")
         free = outcome.terminal_time_source is TerminalTime.FREE
         return plan_gradient(self._free if free else self.scp, outcome, of, method)
 

@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 from dscp_core.cone.convexity import NotConvexError
 from dscp_core.cone.program import ConePattern, ConeValues
 from dscp_core.errors import InvalidInputError
-from dscp_core.problem.declaration import TERMINAL_TIME, OptimalControlProblem
+from dscp_core.problem.declaration import TERMINAL_TIME, OptimalControlProblem, named
 from dscp_core.problem.parameters import ParameterTable
+from dscp_core.problem.tracing import Tracer
 from dscp_core.transcription import faults
 from dscp_core.transcription.analysis import CostAnalysis
 from dscp_core.transcription.compiled import CompiledFunction
@@ -134,6 +135,14 @@ class Transcription:
             [reference, parameters],
             [cost_gradient[: layout.reference_size], cost_gradient[layout.reference_size :]],
         )
+        packed = ca.SX.sym("p", self.table.size)
+        start = Tracer(self.table, packed)(
+            "initial_state",
+            self.problem.initial_state,
+            named(self.problem, packed),
+            rows=layout.nx,
+        )
+        self._initial_state = CompiledFunction("initial_state", [packed], [start])
         guess = stages.initial_guess(parameters)
         guess_seed = ca.MX.sym("guess_seed", layout.reference_size)
         guess_direction = ca.MX.sym("guess_direction", self.table.size)
@@ -215,6 +224,10 @@ class Transcription:
         """Gradient of the true cost with respect to (scaled reference, parameters)."""
         gradient = self._cost_gradient(reference, parameters)
         return gradient[0], gradient[1]
+
+    def initial_state(self, parameters: Array) -> Array:
+        """State (nx,) at the start, SI."""
+        return self._initial_state(parameters)[0]
 
     def initial_guess(self, parameters: Array) -> Array:
         """Reference vector of the first iteration."""

@@ -16,6 +16,7 @@ from dscp_core.gradients.run import DifferentiationError, unrolled
 from dscp_core.planning.certificate import PlanVerifier
 from dscp_core.planning.planner import PlannerSettings, TerminalTime
 from dscp_core.problem.declaration import TERMINAL_TIME, OptimalControlProblem
+from dscp_core.problem.tracing import numeric
 from dscp_core.scp.scp import GRADIENT_TOLERANCE, Scp, ScpOptions, ScpResult, ScpStatus
 from dscp_core.transcription.transcription import Transcription
 from dscp_core.tuning.choice import LossChoice
@@ -267,11 +268,10 @@ class StateEvaluator:
         starts = [packed]
         guess = self._problem.terminal_time_guess
         if self._model.planner.terminal_time is TerminalTime.FREE and guess is not None:
-            values = self._problem.table.unpack(packed)
-            state = [np.ravel(values[name]) for name in self._problem.initial_state_parameters]
+            table, state = self._problem.table, self._transcription.initial_state(packed)
             starts.append(packed.copy())
-            time = self._problem.table.slice(TERMINAL_TIME)
-            starts[-1][time] = guess(np.concatenate(state), values)
+            seconds = numeric("terminal_time_guess", table, guess, packed, state)
+            starts[-1][table.slice(TERMINAL_TIME)] = seconds
         for start in starts:
             # A guess that leaves the model, as a flight of an unfit duration may, is no start.
             if np.all(np.isfinite(self._transcription.initial_guess(start))):

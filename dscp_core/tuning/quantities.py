@@ -117,7 +117,7 @@ def check_corners(
         packed = problem.pack(values)
         packed[first[0]], packed[second[0]] = first[1], second[1]
         try:
-            problem.check_parameters(table.unpack(packed))
+            problem.require_consistent(packed)
         except InvalidInputError as error:
             names = " and ".join(dict.fromkeys((first[2], second[2])))
             raise InvalidInputError(

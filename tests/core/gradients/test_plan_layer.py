@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from core.toy_problems import cart
+from core.toy_problems import Array, cart
 
 from dscp_core import InvalidInputError, Method, Planner, PlannerSettings, TerminalTime, problems
 from dscp_core.scp.trace import ScpStatus
@@ -118,6 +120,29 @@ def test_inputs_are_checked(descent: Planner) -> None:
         layer(terminal_time=torch.zeros(1))
     with pytest.raises(InvalidInputError, match="shape"):
         layer(initial_state=torch.zeros(2, 3))
+    with pytest.raises(InvalidInputError, match=r"got 'shape \(7,\)', expected shape \(7, 7\)"):
+        layer(initial_state=torch.zeros(7))
+    for wrong in (np.zeros((2, 7)), [[0.0] * 7], 1.0, torch.zeros(2, 7, dtype=torch.complex64)):
+        with pytest.raises(InvalidInputError, match="expected a tensor of real numbers"):
+            layer(initial_state=wrong)  # type: ignore[arg-type]
+
+
+def test_checks_of_the_declaration_fail_their_sample_only() -> None:
+    def check(state: Array, values: Mapping[str, Any]) -> None:
+        if state[0] > 0.05:
+            raise InvalidInputError("position", state[0], "at most 0.05")
+        assert values["mass"] < 1.6
+
+    # No initial_state_parameters: the state is what initial_state makes of the parameters.
+    problem = replace(cart(), check_state=check)
+    layer = Planner(problem, PlannerSettings(intervals=6)).layer("cost", ("start", "mass"))
+    start = torch.tensor([[0.0, 0.0], [0.1, 0.0], [0.0, 0.0]])
+    loss = layer(start=start, mass=torch.tensor([1.5, 1.5, 1.7]))
+    assert torch.isnan(loss).tolist() == [False, True, True]
+    assert [sample.message.partition(":")[0] for sample in layer.samples[1:]] == [
+        "position",
+        "check_state",
+    ]
 
 
 def test_a_problem_without_named_initial_state_says_so() -> None:

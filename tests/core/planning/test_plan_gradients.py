@@ -12,6 +12,7 @@ from core.whole_runs import difference
 
 from dscp_core import (
     ConvergenceLoss,
+    CostLoss,
     DifferentiationError,
     FinalStateLoss,
     InvalidInputError,
@@ -187,6 +188,15 @@ def test_plans_of_others_are_refused(planners: dict[str, Planner]) -> None:
     descent = Planner(PROBLEMS["powered_descent"], free)
     with pytest.raises(InvalidInputError, match="terminal time free"):
         descent.gradient("cost", at=planners["powered_descent"].plan())
+
+
+def test_only_outcomes_and_losses_are_differentiated(planners: dict[str, Planner]) -> None:
+    planner = planners["cart"]
+    with pytest.raises(InvalidInputError, match=r"at: got 'a Plan', expected an outcome of plan"):
+        planner.gradient("cost", at=planner.plan().plan)  # type: ignore[arg-type]
+    for wrong in (3, None, CostLoss):
+        with pytest.raises(InvalidInputError, match=r"quantity: got .*, expected a name or a loss"):
+            planner.gradient(wrong)  # type: ignore[arg-type]
 
 
 def test_without_a_plan_there_is_no_gradient(planners: dict[str, Planner]) -> None:

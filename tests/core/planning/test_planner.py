@@ -2,6 +2,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -244,6 +245,13 @@ def test_states_of_wrong_length_are_refused(fixed: Planner, state: Array) -> Non
     assert "shape (7,)" in outcome.message
 
 
+@pytest.mark.parametrize("state", ["high", ["1 m"] * 7, [1.0, [2.0]], {"x": 1.0}])
+def test_states_that_are_no_numbers_are_refused(fixed: Planner, state: Any) -> None:
+    outcome = fixed.plan(state)
+    assert outcome.status is PlanStatus.INVALID_STATE
+    assert outcome.message.endswith("expected numbers")
+
+
 def test_ground_is_where_the_landing_site_is() -> None:
     planner = Planner(
         problems.get("powered_descent"),
@@ -367,6 +375,27 @@ def test_parameters_that_do_not_hold_the_initial_state_are_refused() -> None:
     )
     outcome = Planner(problem, parameters={"start": (0.1, 0.0)}).plan()
     assert outcome.status is PlanStatus.INVALID_STATE
+
+
+def _fails(*_: Any) -> float:
+    raise KeyError("mass")
+
+
+def test_functions_of_numbers_that_fail_are_named() -> None:
+    mend = "expected a function of the parameters' values"
+    outcome = Planner(replace(cart(), check_state=_fails)).plan()
+    assert outcome.status is PlanStatus.INVALID_STATE
+    assert outcome.message.startswith("check_state: got \"KeyError: 'mass' at test_planner.py:")
+    assert outcome.message.endswith(mend)
+    settings = PlannerSettings(intervals=6, terminal_time=TerminalTime.FREE)
+    for guess in (_fails, lambda _x, _p: None):
+        hopeless = replace(cart(), final_state={"speed": lambda p: 1e9}, terminal_time_guess=guess)
+        with pytest.raises(InvalidInputError, match="terminal_time_guess: got "):
+            Planner(hopeless, settings).plan()
+    # The bounds are read where the terminal time is fixed as well.
+    for bounds in (_fails, lambda _p: 3.0):
+        with pytest.raises(InvalidInputError, match="terminal_time_bounds: got "):
+            Planner(replace(cart(), terminal_time_bounds=bounds))
 
 
 def test_only_problems_are_planned() -> None:
