@@ -7,6 +7,7 @@ forward mode of the unrolled map.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,6 +21,7 @@ from dscp_core.gradients.gradient import Gradient, Method
 from dscp_core.gradients.losses import Loss
 from dscp_core.gradients.quantities import quantity
 from dscp_core.scp.scp import Iteration, Scp, ScpResult, ScpStatus
+from dscp_core.transcription.analysis import CostForm
 
 __all__ = [
     "DifferentiationError",
@@ -38,6 +40,8 @@ Array = NDArray[np.float64]
 
 _SETTLED = 1e-5
 """Change of the scaled trajectory by one more iteration, below which it is a fixed point."""
+_GROWTH = 1.001
+"""Growth of a small change per iteration, above which a fixed point repels."""
 _SETTLING_ITERATIONS = 10
 _MOST_SETTLING_ITERATIONS = 60
 
@@ -166,6 +170,8 @@ def implicit(
     reasons = _reasons([linearisation.verdict]) + _non_finite(parameters)
     if residual > 1e-7:
         reasons += (f"fixed-point equation solved to {residual:.1e} only, above 1e-7",)
+    if CostForm.CONVEXIFIED in (transcription.costs.running, transcription.costs.terminal):
+        reasons += _no_minimum(lambda weight: weight - step(weight), size)
     # Where the cost is flat it converges long before the trajectory does.
     drift = float(np.max(np.abs(reference - solution.z[:size])))
     if drift > _SETTLED:
@@ -245,6 +251,32 @@ def is_feasible(scp: Scp, trace: ScpResult) -> bool:
         layout.relative(last.virtual_control) <= scp.virtual_control_tolerance
         and layout.relative(last.defects) <= 10.0 * scp.defect_tolerance
     )
+
+
+def _no_minimum(pull: Callable[[Array], Array], size: int) -> tuple[str, ...]:
+    """Why a fixed point is none of the convexified cost's minima, as far as curvature tells.
+
+    The subproblem's Hessian M is positive where the constraints leave freedom, and the Lagrangian's
+    is M (I - dS/dz) there: it is negative along a direction just where a change of z grows.
+
+    Args:
+        pull: Product with the transpose of dS/dz, (size,) to (size,).
+        size: Of the reference vector.
+    """
+    operator = scipy.sparse.linalg.LinearOperator((size, size), matvec=pull, dtype=np.float64)
+    start = np.random.default_rng(0).standard_normal(size)
+    if not np.any(pull(start)):
+        return ()  # nothing is free
+    try:
+        found = scipy.sparse.linalg.eigs(
+            operator, k=1, which="LR", tol=1e-4, v0=start, return_eigenvectors=False
+        )
+    except scipy.sparse.linalg.ArpackError as error:
+        return (f"cannot be told from a saddle: {error}",)
+    growth = float(found[0].real)
+    if growth <= _GROWTH:
+        return ()
+    return (f"no minimum but a saddle: another iteration takes a small change times {growth:.3g}",)
 
 
 def _gradient(

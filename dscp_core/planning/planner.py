@@ -292,7 +292,8 @@ class Planner:
         again from the problem's guess and differentiates these K iterations. A terminal time that
         is fixed or predicted is held fixed but for its own derivative; a free one moves along with
         the optimum. The number of intervals is fixed. The gradient is not trusted where no feasible
-        plan is there, or where what is differentiated is not the plan any more.
+        plan is there, where what is differentiated is not the plan any more, or at a saddle of a
+        cost whose expansion is convexified.
 
         Args:
             of: ``"cost"``; a state's name, for its final value; ``"convergence"``, the sum of

@@ -19,11 +19,13 @@ from oracles import declared_nlp
 from dscp_core.errors import InvalidInputError
 from dscp_core.gradients.losses import CostLoss
 from dscp_core.gradients.run import implicit, unrolled
+from dscp_core.planning.planner import Planner, PlannerSettings
 from dscp_core.problem.declaration import (
     CostTerm,
     InitialGuess,
     OptimalControlProblem,
     Parameters,
+    PathConstraint,
     StagePoint,
     Variable,
     Where,
@@ -169,6 +171,54 @@ def test_so_it_does_with_a_free_terminal_time(name: str) -> None:
 def test_a_terminal_cost_keeps_its_curvature(name: str) -> None:
     form, problem = ENDS[name]
     assert assert_optimal(problem).transcription.costs.terminal is form
+
+
+def box(running_cost: Cost, terminal_cost: Cost | None = None, still: float = 0.0) -> Planner:
+    """A point in a plane whose speeds are bounded by 1 each."""
+
+    def bound(axis: int, sign: int) -> PathConstraint:
+        return PathConstraint(f"{axis} {sign}", lambda at, p: sign * at.u[axis] - 1, 1.0, "m/s")
+
+    def guess(p: Any, intervals: int) -> InitialGuess:
+        rows = ca.MX(2, intervals + 1)
+        return InitialGuess(rows + still, rows + still)
+
+    problem = replace(
+        plane(running_cost),
+        states=tuple(Variable(n, "m", 1.0, "") for n in "xy"),
+        dynamics=lambda x, u, p: u,
+        initial_state=lambda p: ca.SX(2, 1),
+        final_state={},
+        terminal_cost=terminal_cost,
+        path_constraints=tuple(bound(axis, sign) for axis in (0, 1) for sign in (-1, 1)),
+        initial_guess=guess,
+    )
+    return Planner(problem, PlannerSettings(intervals=6))
+
+
+SADDLES: dict[str, tuple[Cost, Cost | None]] = {
+    "diag(1, -1)": (lambda x, u, p: u[0] ** 2 - u[1] ** 2, None),
+    "product": (lambda x, u, p: u[0] * u[1], None),
+    "of states": (lambda x, u, p: ca.sumsqr(u) / 100 - 10 * x[1] ** 2, None),
+    "at the end": (lambda x, u, p: ca.sumsqr(u) / 100, lambda x, time, p: -ca.sumsqr(x)),
+}
+
+
+@pytest.mark.parametrize("name", SADDLES)
+def test_a_gradient_at_a_saddle_is_not_trusted(name: str) -> None:
+    planner = box(*SADDLES[name])
+    outcome = planner.plan()
+    assert outcome.cost == 0.0
+    gradient = planner.gradient("cost", at=outcome)
+    assert not gradient.trusted
+    assert any("no minimum but a saddle" in reason for reason in gradient.reasons)
+    # From beside the saddle it ends at a minimum.
+    planner = box(*SADDLES[name], still=0.1)
+    outcome = planner.plan()
+    assert outcome.converged
+    assert outcome.cost < -0.5
+    gradient = planner.gradient("cost", at=outcome)
+    assert gradient.trusted, gradient.reasons
 
 
 @pytest.mark.parametrize("name", ["crossed", "rounded norm", "obstacle", "saddle"])
