@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import qdldl
+import scipy.linalg.lapack
 import scipy.sparse as sp
 
 from dscp_core.cone.program import ConePattern, ConeValues, FloatArray
@@ -13,6 +14,8 @@ from dscp_core.errors import InvalidInputError
 _ROUNDING = 1e-9
 # Curvatures below this share of the largest are judged by that: what is left where it cancels.
 _LEAST_SHARE = 1e-6
+# Up to this many superdiagonals a banded factorisation is several times faster than a sparse one.
+_WIDEST_BAND = 40
 
 
 class NotConvexError(InvalidInputError):
@@ -52,23 +55,21 @@ class ConvexityCheck:
         self._pattern = pattern
         rows, columns = pattern.q.indices, pattern.q.columns
         self._diagonal = np.flatnonzero(rows == columns)
-        self._variables = rows[self._diagonal]
-        self._off_diagonal = np.flatnonzero(rows != columns)
-        coupled = np.unique([rows[self._off_diagonal], columns[self._off_diagonal]])
+        # Only variables with products between them need a factorisation.
+        products = rows != columns
+        coupled = np.unique([rows[products], columns[products]])
         position = np.full(pattern.n, -1)
         position[coupled] = np.arange(coupled.size)
-        # Only variables with products between them need a factorisation.
         self._entries = np.flatnonzero(position[rows] >= 0)
-        self._rows, self._columns = rows[self._entries], columns[self._entries]
+        self._rows, self._columns = (position[part[self._entries]] for part in (rows, columns))
         self._own = np.flatnonzero(self._rows == self._columns)
         self._matrix = sp.csc_matrix(
-            (
-                np.where(self._rows == self._columns, 1.0, 0.0),
-                (position[self._rows], position[self._columns]),
-            ),
+            (np.where(self._rows == self._columns, 1.0, 0.0), (self._rows, self._columns)),
             shape=(coupled.size, coupled.size),
         )
-        self._factor = qdldl.Solver(self._matrix, upper=True) if coupled.size else None
+        self._band = int((self._columns - self._rows).max(initial=0))
+        banded = self._band <= _WIDEST_BAND
+        self._factor = None if banded else qdldl.Solver(self._matrix, upper=True)
 
     def check(self, values: ConeValues) -> None:
         """Refuse a matrix with negative curvature beyond rounding.
@@ -76,23 +77,28 @@ class ConvexityCheck:
         Raises:
             NotConvexError: With its least eigenvalue.
         """
-        own = values.q[self._diagonal]
-        largest = float(np.abs(values.q).max(initial=0.0))
-        if largest == 0.0:
+        if not values.q.size:
             return
-        sizes = np.ones(self._pattern.n)
-        sizes[self._variables] = np.maximum(np.abs(own), _LEAST_SHARE * largest)
-        if np.any(own < -_ROUNDING * sizes[self._variables]) or not self._factorable(values, sizes):
+        least_size = _LEAST_SHARE * float(np.abs(values.q).max())
+        least_own = float(values.q[self._diagonal].min())
+        if least_own < -_ROUNDING * least_size or not self._factorable(values.q, least_size):
             upper = self._pattern.q.matrix(values.q).toarray()
             least = least_eigenvalue(upper + np.triu(upper, 1).T)
             raise NotConvexError("Q", f"least eigenvalue {least:.3g}", "positive semidefinite")
 
-    def _factorable(self, values: ConeValues, sizes: FloatArray) -> bool:
+    def _factorable(self, q: FloatArray, least_size: float) -> bool:
         """Whether the scaled matrix, shifted by what is rounding, has positive pivots only."""
-        if self._factor is None or not np.any(values.q[self._off_diagonal]):
+        if self._band == 0 or least_size == 0.0:
             return True
-        scaled = values.q[self._entries] / np.sqrt(sizes[self._rows] * sizes[self._columns])
+        scaled = q[self._entries]
+        root = np.sqrt(np.maximum(np.abs(scaled[self._own]), least_size))
+        scaled /= root[self._rows]
+        scaled /= root[self._columns]
         scaled[self._own] += _ROUNDING
+        if self._factor is None:
+            band = np.zeros((self._band + 1, root.size), order="F")
+            band[self._band + self._rows - self._columns, self._columns] = scaled
+            return bool(scipy.linalg.lapack.dpbtrf(band, overwrite_ab=True)[1] == 0)
         self._matrix.data = scaled
         self._factor.update(self._matrix, upper=True)
-        return bool(np.all(self._factor.factors()[1] > 0.0))
+        return bool(self._factor.factors()[1].min() > 0.0)

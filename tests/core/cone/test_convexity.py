@@ -81,3 +81,18 @@ def test_least_eigenvalue_counts_empty_rows():
     assert least_eigenvalue(np.zeros((3, 3))) == 0.0
     with pytest.raises(NotConvexError, match=r"cost term effort: .*-3 of its Hessian.*convex"):
         require_convex("cost term effort", np.diag([1.0, -3.0]))
+
+
+@pytest.mark.parametrize("size", [8, 60])
+def test_a_variable_that_all_others_multiply(size):
+    # A narrow and a wide band: they are factored in different ways.
+    arrow = np.eye(size)
+    arrow[0, 1:] = arrow[1:, 0] = 0.5
+    for own, convex in ((0.25 * (size - 1), True), (0.25 * (size - 1) - 1e-3, False)):
+        arrow[0, 0] = own
+        program = ConeProgram.from_matrices(arrow, np.zeros(size))
+        if convex:
+            ConvexityCheck(program.pattern).check(program.values)
+        else:
+            with pytest.raises(NotConvexError, match="least eigenvalue -"):
+                ConvexityCheck(program.pattern).check(program.values)
