@@ -211,7 +211,7 @@ class Transcription:
         """Change of the values along a direction of (reference, parameters)."""
         direction = np.concatenate([d_reference, d_parameters])
         pushed = self._pushforward(reference, parameters, direction)[0]
-        if not self._bounded:
+        if not self._bounded or not np.isfinite(pushed).all():
             self._clear(pushed, self._absent(self._values(reference, parameters)[0]))
         return ConeValues.from_flat(self.pattern, pushed)
 

@@ -9,12 +9,14 @@ import casadi as ca
 import numpy as np
 import pytest
 from core.toy_problems import cart
+from core.whole_runs import unit
 
 from dscp_core.cone.program import ConeValues
 from dscp_core.gradients.losses import CostLoss
 from dscp_core.gradients.run import implicit, tangent, unrolled
 from dscp_core.planning.certificate import PlanVerifier
 from dscp_core.problem.declaration import ConeConstraint, OptimalControlProblem, PathConstraint
+from dscp_core.problem.parameters import Parameter
 from dscp_core.scp.scp import Scp, ScpOptions, ScpStatus
 from dscp_core.transcription.transcription import Transcription
 
@@ -130,3 +132,24 @@ def test_certificates_leave_them_out() -> None:
         assert certificate.passed, certificate.reasons
         names.append({check.name for check in certificate.checks})
     assert names[1] - names[0] == {"force_max", "force_min"}
+
+
+def test_a_bound_that_becomes_infinite_where_no_parameter_is() -> None:
+    limit = PathConstraint("speed", lambda at, p: at.x[1] - 1 / p["rate"], 1.0, "m/s")
+    problem = replace(
+        cart(),
+        parameters=(*cart().parameters, Parameter("rate", 0.5, "s/m", "", lower=0.0)),
+        path_constraints=(limit,),
+    )
+    scp = Scp(Transcription(problem, INTERVALS), ScpOptions.for_gradients())
+    result = scp.run(problem.pack({"rate": 0.0}))
+    direction = unit(scp, "mass", 0)
+    reference, parameters = scp.transcription.cost_gradient(
+        result.final_reference, result.parameters
+    )
+    moved = tangent(scp, result, direction).decisions[-1][: reference.size]
+    gradient = unrolled(scp, result, CostLoss())
+    forward = reference @ moved + parameters @ direction
+    assert forward == pytest.approx(gradient.parameters[direction == 1.0][0], rel=1e-9)
+    # By the rate itself there is no derivative, and it says so.
+    assert gradient.reasons == ("gradient is not finite",)
