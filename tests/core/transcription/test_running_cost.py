@@ -21,6 +21,7 @@ from dscp_core.gradients.losses import CostLoss
 from dscp_core.gradients.run import implicit, unrolled
 from dscp_core.planning.planner import Planner, PlannerSettings
 from dscp_core.problem.declaration import (
+    ConeConstraint,
     CostTerm,
     InitialGuess,
     OptimalControlProblem,
@@ -171,6 +172,40 @@ def test_so_it_does_with_a_free_terminal_time(name: str) -> None:
 def test_a_terminal_cost_keeps_its_curvature(name: str) -> None:
     form, problem = ENDS[name]
     assert assert_optimal(problem).transcription.costs.terminal is form
+
+
+def test_a_norm_is_better_bounded_by_a_control() -> None:
+    """As docs/own-problem.md says."""
+    norm = plane(lambda x, u, p: ca.sqrt(1e-2 + ca.sumsqr(u)) + ca.sumsqr(u) / 100)
+    outcome = Planner(norm, PlannerSettings(intervals=INTERVALS)).plan()
+    assert not outcome.converged
+    assert "converged:" not in outcome.headline
+
+    def guess(p: Any, intervals: int) -> InitialGuess:
+        given = norm.initial_guess(p, intervals)
+        return InitialGuess(given.states, ca.vertcat(given.controls, given.controls[0, :]))
+
+    bound = ConeConstraint("norm", lambda at, p: ca.vertcat(at.u[2], 0.1, at.u[:2]), 1.0, "m/s^2")
+    bounded = replace(
+        norm,
+        controls=(*norm.controls, Variable("norm", "m/s^2", 1.0, "")),
+        dynamics=lambda x, u, p: norm.dynamics(x, u[:2], p),
+        running_cost=lambda x, u, p: u[2] + ca.sumsqr(u[:2]) / 100,
+        cone_constraints=(bound,),
+        initial_guess=guess,
+    )
+    scp, result = solved(bounded)
+    layout, end = scp.transcription.layout, result.final_reference
+    best = declared_nlp.solve(
+        norm,
+        norm.table.unpack(norm.pack()),
+        layout.states(end),
+        layout.controls(end)[:, :2],
+        3.0,
+        free=False,
+    )
+    assert best.message == "Solve_Succeeded"
+    assert result.iterations[-1].cost == pytest.approx(best.cost, rel=1e-7)
 
 
 def box(running_cost: Cost, terminal_cost: Cost | None = None, still: float = 0.0) -> Planner:
