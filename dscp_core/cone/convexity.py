@@ -6,6 +6,7 @@ import numpy as np
 import qdldl
 import scipy.linalg.lapack
 import scipy.sparse as sp
+import scipy.sparse.linalg
 
 from dscp_core.cone.program import ConePattern, ConeValues, FloatArray
 from dscp_core.errors import InvalidInputError
@@ -14,6 +15,8 @@ from dscp_core.errors import InvalidInputError
 _ROUNDING = 1e-9
 # Curvatures below this share of the largest are judged by that: what is left where it cancels.
 _LEAST_SHARE = 1e-6
+# Variables up to which the offending eigenvalue is found in a dense matrix.
+_MOST_DENSE = 2000
 # Up to this many superdiagonals a banded factorisation is several times faster than a sparse one.
 _WIDEST_BAND = 40
 
@@ -82,8 +85,13 @@ class ConvexityCheck:
         least_size = _LEAST_SHARE * float(np.abs(values.q).max())
         least_own = float(values.q[self._diagonal].min())
         if least_own < -_ROUNDING * least_size or not self._factorable(values.q, least_size):
-            upper = self._pattern.q.matrix(values.q).toarray()
-            least = least_eigenvalue(upper + np.triu(upper, 1).T)
+            upper = self._pattern.q.matrix(values.q)
+            full = upper + sp.triu(upper, 1).T
+            if self._pattern.n <= _MOST_DENSE:
+                least = least_eigenvalue(full.toarray())
+            else:
+                found = scipy.sparse.linalg.eigsh(full, 1, which="SA", return_eigenvectors=False)
+                least = float(found[0])
             raise NotConvexError("Q", f"least eigenvalue {least:.3g}", "positive semidefinite")
 
     def _factorable(self, q: FloatArray, least_size: float) -> bool:

@@ -29,6 +29,7 @@ from dscp_core.problem.parameters import Value
 from dscp_core.problem.tracing import Tracer, numeric
 from dscp_core.problem.trajectory import Plan
 from dscp_core.scp.scp import Scp, ScpStatus
+from dscp_core.transcription.stages import terminal_time_bounds
 from dscp_core.transcription.transcription import Transcription
 
 if TYPE_CHECKING:
@@ -127,14 +128,14 @@ class Planner:
         Raises:
             InvalidInputError: They are in the wrong order, or not positive.
         """
-        if self.problem.terminal_time_bounds is None:
-            return 0.0, math.inf
-        table, what = self.problem.table, "terminal_time_bounds"
+        table = self.problem.table
         values = {n: ca.SX(v) for n, v in table.unpack(self.parameters).items()}
-        pair = Tracer(table).pair(what, self.problem.terminal_time_bounds, values)
+        pair = terminal_time_bounds(self.problem, Tracer(table), values)
         low, high = (float(bound) for bound in pair)
         if not 0.0 < low <= high:
-            raise InvalidInputError(what, (low, high), "0 < least <= greatest, in seconds")
+            raise InvalidInputError(
+                "terminal_time_bounds", (low, high), "0 < least <= greatest, in seconds"
+            )
         return low, high
 
     @property
@@ -346,6 +347,8 @@ class Planner:
 
         if outcome.plan is None or outcome.certificate is None:
             raise InvalidInputError("outcome", outcome.headline, "one with a plan")
+        if title is None and not outcome.converged:
+            title = f"{self.problem.name.replace('_', ' ')}: {outcome.headline}"
         return plan_figure(
             self.problem, outcome.plan, outcome.certificate, outcome.parameters, title
         )

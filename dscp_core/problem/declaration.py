@@ -114,7 +114,7 @@ class OptimalControlProblem:
             product of the changes of Theta and T left out.
         quadrature: How the running cost is summed over the nodes.
         free_terminal_time: Whether the terminal time is a decision unless asked otherwise.
-        terminal_time_bounds: Least and greatest terminal time when it is free, or None.
+        terminal_time_bounds: Least and greatest free terminal time; None for the parameter's own.
         initial_state_parameters: Names of the parameters that hold the initial state; their
             values, one after the other, are the states in order.
         vehicle_tables: What a vehicle file may name besides parameters: name to a function that

@@ -23,11 +23,12 @@ from dscp_core.problem.declaration import (
     Constraint,
     InitialGuess,
     OptimalControlProblem,
+    Parameters,
     PathConstraint,
     Where,
     named,
 )
-from dscp_core.problem.tracing import called
+from dscp_core.problem.tracing import Tracer, called
 from dscp_core.transcription.analysis import CostAnalysis, CostForm, analyse
 from dscp_core.transcription.costs import (
     add_running_cost,
@@ -43,6 +44,8 @@ from dscp_core.transcription.stage import Collector, Kind, Stage, Symbols
 Array = NDArray[np.float64]
 
 # Those of 220 states that all act on each other; they take 10 s.
+_LEAST_TIME = 1e-3
+"""Of the default: least free terminal time where the parameter has no positive lower bound."""
 _MOST_NONZEROS = 100_000
 
 
@@ -263,15 +266,27 @@ def _terminal_stage(
         relative = decision[0] / reference[0] - 1
         weight = symbols.parameters[TRUST_REGION_STEP]
         collect.quadratic("trust_region_step", weight * relative**2, symbols)
-        if problem.terminal_time_bounds is not None:
-            lower, upper = symbols.trace.pair(
-                "terminal_time_bounds", problem.terminal_time_bounds, symbols.parameters
-            )
-            rows = ca.jacobian(ca.vertcat(-decision[0], decision[0]), decision)
-            collect.matrix(Kind.CONE_MATRIX, TERMINAL_TIME, rows)
-            bound = ca.vertcat(-lower, upper) / layout.time_scale
-            collect.vector(Kind.CONE_VECTOR, TERMINAL_TIME, bound)
+        lower, upper = terminal_time_bounds(problem, symbols.trace, symbols.parameters)
+        rows = ca.jacobian(ca.vertcat(-decision[0], decision[0]), decision)
+        collect.matrix(Kind.CONE_MATRIX, TERMINAL_TIME, rows)
+        bound = ca.vertcat(-lower, upper) / layout.time_scale
+        collect.vector(Kind.CONE_VECTOR, TERMINAL_TIME, bound)
     return collect.stage("terminal", reference, symbols.packed)
+
+
+def terminal_time_bounds(
+    problem: OptimalControlProblem, trace: Tracer, parameters: Parameters
+) -> tuple[ca.SX, ca.SX]:
+    """Least and greatest free terminal time, s: as declared, or else the parameter's own bounds.
+
+    Raises:
+        InvalidInputError: What the declared function returns is no pair of scalars.
+    """
+    if problem.terminal_time_bounds is not None:
+        return trace.pair("terminal_time_bounds", problem.terminal_time_bounds, parameters)
+    own = problem.table[TERMINAL_TIME]
+    least = own.lower if own.lower > 0.0 else _LEAST_TIME * float(np.ravel(own.default)[0])
+    return ca.SX(least), ca.SX(own.upper)
 
 
 def _boundary_stage(

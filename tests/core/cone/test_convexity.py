@@ -96,3 +96,12 @@ def test_a_variable_that_all_others_multiply(size):
         else:
             with pytest.raises(NotConvexError, match="least eigenvalue -"):
                 ConvexityCheck(program.pattern).check(program.values)
+
+
+def test_the_least_eigenvalue_of_a_large_program_is_found_without_a_dense_matrix():
+    size = 4000
+    matrix = sp.diags_array(np.linspace(1.0, 2.0, size), format="lil")
+    matrix[7, 8] = matrix[8, 7] = 3.0
+    program = ConeProgram.from_matrices(sp.csc_array(matrix), np.zeros(size))
+    with pytest.raises(NotConvexError, match="least eigenvalue -2"):
+        ConvexityCheck(program.pattern).check(program.values)

@@ -13,6 +13,7 @@ from oracles.powered_descent_physics import state_rate
 
 from dscp_core import problems
 from dscp_core.cone.program import ConeProgram, ConeValues
+from dscp_core.planning.planner import Planner
 from dscp_core.problem.declaration import CostTerm, Variable, Where
 from dscp_core.problem.parameters import Value
 from dscp_core.scp.scp import Scp, ScpOptions, ScpStatus
@@ -314,11 +315,16 @@ def test_free_time_has_no_effect_on_a_fixed_problem_but_through_the_decision() -
     assert masses[1] == pytest.approx(masses[0], abs=1e-4)
 
 
-def test_time_bounds_are_optional() -> None:
+def test_without_time_bounds_those_of_the_parameter_count() -> None:
     transcription = Transcription(cart(), 4, free_terminal_time=True)
     parameters = transcription.table.pack()
     reference = transcription.initial_guess(parameters)
-    assert transcription.pattern.n_cone_rows == 2 * 5
+    assert transcription.pattern.n_cone_rows == 2 + 2 * 5
+    groups = transcription.values(reference, parameters).h[:2] * transcription.layout.time_scale
+    np.testing.assert_allclose(groups, [-0.1, 10.0])
+    # Less effort takes longer, without end: the bound is where it stops.
+    planner = Planner(cart(), intervals=10, terminal_time="free")
+    assert planner.plan().terminal_time_used_s == pytest.approx(10.0, abs=1e-5)
     assert transcription.terminal_time(reference, parameters) == 2.0
     assert ca.DM(reference).shape == (1 + 5 * 3, 1)
 

@@ -283,7 +283,16 @@ def test_a_guess_that_is_not_finite_is_named() -> None:
 
 
 def test_an_unbounded_subproblem_says_what_lacks_a_bound() -> None:
-    problem = replace(CART, running_cost=lambda x, u, p: 1 + u[0] ** 2, path_constraints=())
+    endless = tuple(
+        replace(p, lower=-math.inf, upper=math.inf) if p.name == "terminal_time" else p
+        for p in CART.parameters
+    )
+    problem = replace(
+        CART,
+        parameters=endless,
+        running_cost=lambda x, u, p: u[0] ** 2 - 1,  # the longer, the better
+        path_constraints=(),
+    )
     scp = Scp(Transcription(problem, 4, free_terminal_time=True))
     result = scp.run(problem.pack())
     assert result.status is ScpStatus.SOLVER_FAILURE
