@@ -6,7 +6,6 @@ import os
 import signal
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -30,6 +29,7 @@ from trajectory_msgs.msg import JointTrajectory
 
 from benchmarks.cases import Array
 from dscp_core.problems import get
+from dscp_ros.spinning import SpinningThread
 from msg_adapters.joint_state import joint_state_from_state
 from msg_adapters.layout import problem_layout
 from msg_adapters.report_message import report_from_message
@@ -118,8 +118,7 @@ class _Client:
         self._node.create_subscription(DiagnosticArray, REPORT_TOPIC, self._on_report, _REPORTS)
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)
-        self._thread = threading.Thread(target=self._executor.spin, daemon=True)
-        self._thread.start()
+        self._thread = SpinningThread(self._executor, "benchmark")
 
     def __enter__(self) -> _Client:
         return self
@@ -130,8 +129,7 @@ class _Client:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        self._executor.shutdown()
-        self._thread.join(_WAIT_S)
+        self._thread.stop(_WAIT_S)
         self._node.destroy_node()
         rclpy.shutdown(context=self._context)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gc
-import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import replace
@@ -22,6 +21,7 @@ from dscp_ros.replay.progress import Progress
 from dscp_ros.replay.publishers import create_publishers, selected_topics
 from dscp_ros.replay.schedule import replay_window
 from dscp_ros.replay.wake import Wake, stop_signals
+from dscp_ros.spinning import SpinningThread
 
 if TYPE_CHECKING:
     from dscp_ros.replay.options import ReplayOptions
@@ -108,13 +108,11 @@ def _node(ros_args: Sequence[str]) -> Iterator[Node]:
         node = Node(NODE_NAME, context=context)
         executor = SingleThreadedExecutor(context=context)
         executor.add_node(node)
-        thread = threading.Thread(target=executor.spin, name="replay-services")
-        thread.start()
+        thread = SpinningThread(executor, "replay-services")
         try:
             yield node
         finally:
-            executor.shutdown(_SHUTDOWN_S)
-            thread.join(_SHUTDOWN_S)
+            thread.stop(_SHUTDOWN_S)
             node.destroy_node()
     finally:
         rclpy.shutdown(context=context)

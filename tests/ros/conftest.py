@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -21,6 +20,8 @@ if TYPE_CHECKING:
     from rclpy.context import Context
     from rclpy.executors import SingleThreadedExecutor
     from rclpy.node import Node
+
+    from dscp_ros.spinning import SpinningThread
 
 WAIT_TIMEOUT_S = 10.0
 """How long `wait_for` waits unless told: far above the 0.5 s that discovery may take."""
@@ -52,10 +53,17 @@ class RosHarness:
         executor: Spins in a daemon thread.
     """
 
-    def __init__(self, domain_id: int, context: Context, executor: SingleThreadedExecutor) -> None:
+    def __init__(
+        self,
+        domain_id: int,
+        context: Context,
+        executor: SingleThreadedExecutor,
+        thread: SpinningThread,
+    ) -> None:
         self.domain_id = domain_id
         self.context = context
         self.executor = executor
+        self._thread = thread
         self._nodes: list[Node] = []
 
     def create_node(self, name: str, **kwargs: object) -> Node:
@@ -83,6 +91,10 @@ class RosHarness:
         """Same as the module's `wait_for`."""
         return wait_for(predicate, timeout)
 
+    def stop_spinning(self) -> bool:
+        """No callback runs any more; returns whether the thread ended in time."""
+        return self._thread.stop(5.0)
+
     def destroy_nodes(self) -> None:
         """Destroys every node of the harness. The executor must have been shut down."""
         for node in self._nodes:
@@ -103,18 +115,18 @@ def ros() -> Iterator[RosHarness]:
     from rclpy.context import Context
     from rclpy.executors import SingleThreadedExecutor
 
+    from dscp_ros.spinning import SpinningThread
+
     context = Context()
     domain_id = _free_domain_id()
     rclpy.init(context=context, domain_id=domain_id, args=[])
     executor = SingleThreadedExecutor(context=context)
-    harness = RosHarness(domain_id, context, executor)
-    thread = threading.Thread(target=executor.spin, name="ros-test-executor", daemon=True)
-    thread.start()
+    thread = SpinningThread(executor, "ros-test-executor")
+    harness = RosHarness(domain_id, context, executor, thread)
     try:
         yield harness
     finally:
-        executor.shutdown(5.0)
-        thread.join(5.0)
+        ended = harness.stop_spinning()
         harness.destroy_nodes()
         rclpy.shutdown(context=context)
-        assert not thread.is_alive(), "the executor's thread did not end"
+        assert ended, "the executor's thread did not end"

@@ -39,7 +39,7 @@ def test_a_recording_holds_messages_times_and_quality_of_service(ros: Any, tmp_p
             value.publish(Float64(data=float(number)))
         assert ros.wait_for(lambda: recorder.counts == {"/note": 1, "/value": 10, "/never": 0})
         after_ns = time.time_ns()
-        ros.executor.shutdown(5.0)
+        ros.stop_spinning()
     with BagReader(tmp_path / "bag") as reader:
         decoded = list(reader.decoded_messages(["/value"]))
         assert [m.data for _, m in decoded] == [float(number) for number in range(10)]
@@ -67,7 +67,7 @@ def test_simulated_time_is_the_log_time(ros: Any, tmp_path: Path) -> None:
         assert ros.wait_for(lambda: value.get_subscription_count() == 1)
         value.publish(Float64(data=1.0))
         assert ros.wait_for(lambda: recorder.counts["/value"] == 1)
-        ros.executor.shutdown(5.0)
+        ros.stop_spinning()
     with BagReader(tmp_path / "bag") as reader:
         assert reader.start_ns == 1234 * 10**9
 
