@@ -13,6 +13,7 @@ from benchmarks.report import Report
 from benchmarks.timing import Array, alternated, clocked, median_ms, p99_ms
 from dscp_core.learning.network_torch import TorchNetwork
 from dscp_core.planning.terminal_time_network import NetworkData, TerminalTimeNetwork
+from dscp_core.problems.powered_descent.definition import NETWORK
 
 TIME_TARGET_MS = 0.2
 DIFFERENCE_TARGET = 1e-12
@@ -29,7 +30,7 @@ def measure(*, quick: bool) -> Report:
     """Time predictions one at a time, as the planner asks for them."""
     report = Report("prediction")
     torch.set_num_threads(1)
-    network, load_s, _ = clocked(TerminalTimeNetwork.load)
+    network, load_s, _ = clocked(lambda: TerminalTimeNetwork.load(NETWORK))
     theirs = torch_network(network.data)
     states = box_states(STATES, seed=1)
     rounds = 300 if quick else 3000

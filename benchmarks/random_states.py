@@ -11,6 +11,7 @@ import numpy as np
 from benchmarks.cases import Array, box_states
 from benchmarks.report import Cell, Report, Table
 from benchmarks.timing import clocked, median_ms, p99_ms
+from dscp_core import problems
 from dscp_core.planning.plan import PlanOutcome, PlanStatus
 from dscp_core.planning.planner import Planner, PlannerSettings, TerminalTime
 from dscp_core.problem.declaration import TERMINAL_TIME
@@ -42,7 +43,8 @@ def measure(*, quick: bool) -> Report:
     for solver in SOLVERS:
         for mode in (TerminalTime.FREE, TerminalTime.FIXED):
             planner = Planner(
-                PlannerSettings(terminal_time=mode, options=ScpOptions(solver=solver))
+                problems.get("powered_descent"),
+                PlannerSettings(terminal_time=mode, options=ScpOptions(solver=solver)),
             )
             times = None if mode is TerminalTime.FREE or optimal is None else optimal + margins
             attempts = _plan(planner, states, times)

@@ -184,7 +184,7 @@ def _compare(
                     gradient=found,
                     difference=(ahead - behind) / (2.0 * step),
                     reasons=gradient.reasons,
-                    radius_over_step=tangent.active_set_radius / step,
+                    radius_over_step=moving.active_set_radius / step,
                     forward_reverse=abs(float(explicit @ change) - found) / size,
                 )
             )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import multiprocessing
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -57,7 +58,7 @@ def _measure_scaling(report: Report, counts: tuple[int, ...]) -> None:
     with _objective(min(2, available_cores())) as objective:
         _evaluate(objective, counts[0])  # workers start, and allocate what they keep
         for count in counts:
-            found, wall, _ = clocked(lambda count=count: _evaluate(objective, count))
+            found, wall, _ = clocked(partial(_evaluate, objective, count))
             rows.append(
                 (count, 1e3 * wall / count, found.iterations, found.untrusted, *_peaks_mib())
             )
@@ -89,7 +90,7 @@ def _measure_workers(report: Report, count: int, rounds: int) -> None:
             _evaluate(objective, 16)
         seconds = np.array(
             [
-                [clocked(lambda o=objective: _evaluate(o, count))[1] for objective in (one, two)]
+                [clocked(partial(_evaluate, objective, count))[1] for objective in (one, two)]
                 for _ in range(rounds)
             ]
         )
