@@ -270,12 +270,11 @@ def _point(planner: Planner, time_s: float) -> SweepPoint:
     difference = RunDifferences(scp, trace, _LOSS).derivative(TERMINAL_TIME)
     value = math.nan if difference.value is None else difference.value
     error = relative_error(slope, difference, max(abs(slope), abs(value)))
-    virtual = trace.iterations[-1].virtual_control / planner.transcription.layout.state_scale
     converged = trace.status is ScpStatus.CONVERGED
     return replace(
         point,
         final_mass_kg=gradient.value,
-        virtual_control=float(np.max(np.abs(virtual))),
+        virtual_control=planner.transcription.layout.relative(trace.iterations[-1].virtual_control),
         gradient_kg_s=slope,
         trusted=gradient.trusted and converged,
         central_difference_kg_s=value,
