@@ -10,7 +10,6 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from enum import Enum
 
 import casadi as ca
 import numpy as np
@@ -27,6 +26,7 @@ from dscp_core.problem.declaration import (
     Where,
     named,
 )
+from dscp_core.problem.flight import ControlHold
 from dscp_core.problem.tracing import Tracer
 from dscp_core.transcription.compiled import CompiledFunction
 from dscp_core.transcription.stages import constraints
@@ -34,17 +34,6 @@ from dscp_core.transcription.stages import constraints
 Array = NDArray[np.float64]
 
 _INTEGRATED = "Integration successful."  # odeint's word; it has no status code
-
-
-class ControlHold(Enum):
-    """How the planned controls are flown between nodes.
-
-    MEAN: constant over each interval at the mean of its two nodes, which is what the midpoint
-    rule assumes. LINEAR: linear between the nodes.
-    """
-
-    MEAN = "mean"
-    LINEAR = "linear"
 
 
 @dataclass(frozen=True)

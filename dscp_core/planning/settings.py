@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dscp_core.errors import InvalidInputError
-from dscp_core.planning.certificate import ControlHold
 from dscp_core.planning.plan import TerminalTime
 from dscp_core.problem.declaration import OptimalControlProblem
+from dscp_core.problem.flight import ControlHold
 from dscp_core.problem.parameters import Value
 from dscp_core.scp.scp import ScpOptions
 

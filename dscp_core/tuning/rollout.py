@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from dscp_core.errors import InvalidInputError
 from dscp_core.gradients.losses import LossGradient
-from dscp_core.planning.certificate import ControlHold
 from dscp_core.problem.declaration import TERMINAL_TIME, named
+from dscp_core.problem.flight import ControlHold
 from dscp_core.scp.scp import ScpResult
 from dscp_core.transcription.compiled import CompiledFunction
 from dscp_core.transcription.transcription import Transcription

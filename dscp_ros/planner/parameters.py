@@ -13,9 +13,9 @@ from typing import Any
 from dscp_core import problems
 from dscp_core.cone.solvers import SOLVER_NAMES
 from dscp_core.errors import InvalidInputError
-from dscp_core.planning.certificate import ControlHold
 from dscp_core.planning.planner import PlannerSettings, TerminalTime
 from dscp_core.problem.declaration import OptimalControlProblem
+from dscp_core.problem.flight import ControlHold
 from dscp_core.scp.scp import ScpOptions
 from dscp_ros.planner.declaration import VEHICLE_PREFIX, NodeParameter, Value
 from dscp_ros.planner.input_checks import InputSettings

@@ -17,10 +17,11 @@ from oracles.powered_descent_physics import (
 
 from dscp_core import problems
 from dscp_core.errors import InvalidInputError
-from dscp_core.planning.certificate import Check, ControlHold, PlanCertificate, PlanVerifier
+from dscp_core.planning.certificate import Check, PlanCertificate, PlanVerifier
 from dscp_core.planning.plan import PlanStatus
 from dscp_core.planning.planner import Planner
 from dscp_core.problem.declaration import PathConstraint
+from dscp_core.problem.flight import ControlHold
 from dscp_core.scp.scp import Scp, ScpStatus
 from dscp_core.transcription.transcription import Transcription
 

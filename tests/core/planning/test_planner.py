@@ -14,9 +14,9 @@ from oracles.powered_descent_physics import PAPER_INITIAL_STATE, PAPER_PARAMETER
 from dscp_core import problems
 from dscp_core.cone.solvers import SolverSettings
 from dscp_core.errors import InvalidInputError
-from dscp_core.planning.certificate import ControlHold
 from dscp_core.planning.plan import PlanOutcome, PlanStatus
 from dscp_core.planning.planner import Planner, PlannerSettings, TerminalTime
+from dscp_core.problem.flight import ControlHold
 from dscp_core.problem.trajectory import Plan
 from dscp_core.scp.scp import ScpOptions
 

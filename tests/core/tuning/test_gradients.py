@@ -12,9 +12,10 @@ from core import tuning_support as support
 from core.whole_runs import difference
 
 from dscp_core import problems
-from dscp_core.planning.certificate import ControlHold, PlanVerifier
+from dscp_core.planning.certificate import PlanVerifier
 from dscp_core.planning.planner import PlannerSettings, TerminalTime
 from dscp_core.problem.declaration import TERMINAL_TIME, OptimalControlProblem
+from dscp_core.problem.flight import ControlHold
 from dscp_core.scp.scp import Scp, ScpOptions
 from dscp_core.transcription.transcription import Transcription
 from dscp_core.tuning.choice import cost_is_minus_mass
