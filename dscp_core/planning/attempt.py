@@ -14,7 +14,9 @@ from dscp_core.errors import InvalidInputError
 from dscp_core.planning.certificate import PlanVerifier
 from dscp_core.planning.plan import PlanOutcome, PlanStatus, TerminalTime
 from dscp_core.problem.declaration import TERMINAL_TIME, OptimalControlProblem
+from dscp_core.problem.flight import Discretisation
 from dscp_core.problem.trajectory import Plan
+from dscp_core.scp.restoration import restored
 from dscp_core.scp.scp import Iteration, Scp, ScpResult, ScpStatus
 
 Array = NDArray[np.float64]
@@ -115,7 +117,9 @@ class Attempt:
         chosen = _chosen(scp, result)
         if chosen is not None:
             layout = scp.transcription.layout
-            plan = self._plan(scp, chosen.solution.z, result.parameters)
+            trajectory = _flyable(scp, chosen, result.parameters)
+            plan = self._plan(scp, trajectory, result.parameters)
+            evaluation = scp.transcription.evaluate(trajectory, result.parameters)
             certificate = self._verifier.certify(
                 plan.times_s, plan.states, plan.controls, result.parameters
             )
@@ -134,8 +138,8 @@ class Attempt:
                 "certificate": certificate,
                 "terminal_time_used_s": plan.terminal_time_s,
                 "virtual_control": layout.relative(chosen.virtual_control),
-                "max_defect": layout.relative(chosen.defects),
-                "cost": chosen.cost,
+                "max_defect": layout.relative(evaluation.defects),
+                "cost": evaluation.cost,
             }
         return self._outcome(status, message, start.parameters, start.source, **found)
 
@@ -198,6 +202,15 @@ def _chosen(scp: Scp, result: ScpResult) -> Iteration | None:
         if _satisfies_dynamics(scp, iteration):
             return iteration
     return result.iterations[-1] if result.iterations else None
+
+
+def _flyable(scp: Scp, iteration: Iteration, parameters: Array) -> Array:
+    """The iterate's trajectory, without its last defects where the dynamics are the flown ones."""
+    trajectory = iteration.solution.z[: iteration.reference.size]
+    propagated = scp.transcription.discretisation is Discretisation.PROPAGATED
+    if propagated and _satisfies_dynamics(scp, iteration):
+        return restored(scp.transcription, trajectory, parameters)
+    return trajectory
 
 
 def _satisfies_dynamics(scp: Scp, iteration: Iteration) -> bool:

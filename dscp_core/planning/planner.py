@@ -118,7 +118,11 @@ class Planner:
 
     def _loop(self, *, free: bool) -> Scp:
         transcription = Transcription(
-            self.problem, self.settings.intervals, free_terminal_time=free
+            self.problem,
+            self.settings.intervals,
+            free_terminal_time=free,
+            discretisation=self.settings.discretisation,
+            hold=self.settings.hold,
         )
         return Scp(transcription, self.settings.options)
 

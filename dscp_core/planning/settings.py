@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from dscp_core.errors import InvalidInputError
 from dscp_core.planning.plan import TerminalTime
 from dscp_core.problem.declaration import OptimalControlProblem
-from dscp_core.problem.flight import ControlHold
+from dscp_core.problem.flight import ControlHold, Discretisation
 from dscp_core.problem.parameters import Value
 from dscp_core.scp.scp import ScpOptions
 
@@ -35,13 +35,15 @@ class TerminalTimePredictor(Protocol):
 class PlannerSettings:
     """How to plan, and with which parameters; `suited` has what suits a problem.
 
-    The terminal time and the hold may be given by their values too, such as ``"free"``.
+    The terminal time, the hold and the discretisation may be given by their values too, such as
+    ``"free"``.
 
     Attributes:
         parameters: Vehicle, mission and algorithm parameters that differ from the defaults, SI.
         intervals: Number N of intervals.
         terminal_time: Where the terminal time comes from.
-        hold: How the certificate flies the controls between the nodes.
+        hold: How the controls are flown between the nodes.
+        discretisation: Dynamics of the intervals: those that are flown, or the paper's.
         options: How to iterate; its deadline is set for every plan.
 
     Example:
@@ -55,10 +57,15 @@ class PlannerSettings:
     intervals: int = 50
     terminal_time: TerminalTime = TerminalTime.FIXED
     hold: ControlHold = ControlHold.MEAN
+    discretisation: Discretisation = Discretisation.PROPAGATED
     options: ScpOptions = field(default_factory=ScpOptions)
 
     def __post_init__(self) -> None:
-        for name, kind in (("terminal_time", TerminalTime), ("hold", ControlHold)):
+        for name, kind in (
+            ("terminal_time", TerminalTime),
+            ("hold", ControlHold),
+            ("discretisation", Discretisation),
+        ):
             try:
                 object.__setattr__(self, name, kind(getattr(self, name)))
             except ValueError:

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dscp_core.problem import checks
+from dscp_core.problem.flight import ControlHold
 from dscp_core.problem.parameters import ParameterTable
 from dscp_core.problem.tracing import numeric
 
@@ -234,6 +235,8 @@ class CostTerm:
         expression: Returns a scalar, at most quadratic and convex in the decision; arguments are
             the decision's point, the reference's point and the parameters. Units of the cost.
         where: Node or interval mean.
+        hold: How the dynamics see the controls between the nodes where this term counts, the
+            midpoint rule being MEAN; None for always.
 
     Example:
         >>> import casadi as ca
@@ -245,10 +248,11 @@ class CostTerm:
     name: str
     expression: Callable[[StagePoint, StagePoint, Parameters], ca.SX]
     where: Where = Where.MEAN
+    hold: ControlHold | None = None
 
     def __post_init__(self) -> None:
         checks.named("name of a cost term", self.name)
-        checks.plain(f"cost term {self.name}", self, Where=Where)
+        checks.plain(f"cost term {self.name}", self, Where=Where, ControlHold=ControlHold)
         checks.function(f"cost term {self.name}", self.expression)
 
 

@@ -10,7 +10,30 @@ class ControlHold(Enum):
 
     MEAN: constant over each interval at the mean of its two nodes, which is what the midpoint
     rule assumes. LINEAR: linear between the nodes.
+
+    Example:
+        >>> from dscp_core import ControlHold, Planner, problems
+        >>> planner = Planner(problems.get("powered_descent"), hold=ControlHold.LINEAR)
+        >>> planner.plan().certificate.hold.value
+        'linear'
     """
 
     MEAN = "mean"
     LINEAR = "linear"
+
+
+class Discretisation(Enum):
+    """What the dynamics of a subproblem's intervals are.
+
+    PROPAGATED: every interval is integrated from its first node under the declared hold, so that
+    a converged plan flies as planned. MIDPOINT: the paper's rule (eq. ch2-disdy), whose plans miss
+    by its error when they are flown.
+
+    Example:
+        >>> from dscp_core import Discretisation, PlannerSettings
+        >>> PlannerSettings().discretisation is Discretisation.PROPAGATED
+        True
+    """
+
+    PROPAGATED = "propagated"
+    MIDPOINT = "midpoint"

@@ -7,7 +7,7 @@ go. They are mapped over the trajectory, so that their size does not grow with N
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import casadi as ca
 import numpy as np
@@ -28,6 +28,7 @@ from dscp_core.problem.declaration import (
     Where,
     named,
 )
+from dscp_core.problem.flight import ControlHold, Discretisation
 from dscp_core.problem.tracing import Tracer, called
 from dscp_core.transcription.analysis import CostAnalysis, CostForm, analyse
 from dscp_core.transcription.costs import (
@@ -38,6 +39,7 @@ from dscp_core.transcription.costs import (
     running_cost,
     terminal_cost,
 )
+from dscp_core.transcription.dynamics import defect
 from dscp_core.transcription.layout import TrajectoryLayout
 from dscp_core.transcription.stage import Collector, Kind, Stage, Symbols
 
@@ -156,14 +158,22 @@ def initial_guess(
     return InitialGuess(*parts)
 
 
-def build_stages(problem: OptimalControlProblem, layout: TrajectoryLayout) -> StageFunctions:
+def build_stages(
+    problem: OptimalControlProblem,
+    layout: TrajectoryLayout,
+    discretisation: Discretisation,
+    hold: ControlHold,
+) -> StageFunctions:
     """Derive every stage of a problem: linearisation (eqs. 6 to 8) and quadratic costs.
 
     Raises:
         InvalidInputError: A function of the declaration is wrong.
     """
+    seen = ControlHold.MEAN if discretisation is Discretisation.MIDPOINT else hold
+    terms = tuple(term for term in problem.cost_terms if term.hold in (None, seen))
+    problem = replace(problem, cost_terms=terms)
     pair, single = Symbols(problem, layout, 2), Symbols(problem, layout, 1)
-    defect = _defect(problem, pair)
+    residual = defect(problem, pair, discretisation, hold)
     packed = ca.MX.sym("parameters", problem.table.size)
     guess = initial_guess(problem, layout.intervals, packed)
     guessed = ca.Function("guess", [packed], [guess.states.T, guess.controls.T])
@@ -180,11 +190,11 @@ def build_stages(problem: OptimalControlProblem, layout: TrajectoryLayout) -> St
         layout,
         costs,
         node_weights(problem.quadrature, layout.intervals),
-        _interval_stage(problem, layout, pair, defect, costs),
+        _interval_stage(problem, layout, pair, residual, costs),
         _node_stage(problem, layout, single, costs),
         _terminal_stage(problem, layout, single, costs),
         _boundary_stage(problem, layout, single),
-        ca.Function("defect", [pair.reference, pair.packed], [defect]),
+        ca.Function("defect", [pair.reference, pair.packed], [residual]),
         ca.Function(
             "running_cost",
             [summed.reference, summed.packed],
@@ -198,30 +208,15 @@ def build_stages(problem: OptimalControlProblem, layout: TrajectoryLayout) -> St
     )
 
 
-def _defect(problem: OptimalControlProblem, symbols: Symbols) -> ca.SX:
-    """Residual of the discrete dynamics at the reference, eq. ch2-disdy, SI."""
-    first, second = symbols.nodes(symbols.reference)
-    mean = symbols.mean(symbols.reference)
-    rates = symbols.trace(
-        "dynamics",
-        problem.dynamics,
-        mean.x,
-        mean.u,
-        symbols.parameters,
-        rows=len(problem.states),
-    )
-    return second.x - first.x - mean.step * rates
-
-
 def _interval_stage(
     problem: OptimalControlProblem,
     layout: TrajectoryLayout,
     symbols: Symbols,
-    defect: ca.SX,
+    residual: ca.SX,
     costs: CostAnalysis,
 ) -> Stage:
     collect = Collector()
-    residual = defect / ca.DM(layout.state_scale)
+    residual = residual / ca.DM(layout.state_scale)
     nonzeros = ca.jacobian_sparsity(residual, symbols.reference).nnz()
     if nonzeros > _MOST_NONZEROS:
         bound = f"at most {_MOST_NONZEROS} nonzeros: more take minutes to compile"

@@ -1,4 +1,4 @@
-"""Midpoint-trapezoid transcription of an optimal control problem to a cone program.
+"""Transcription of an optimal control problem to a cone program.
 
 One compiled function maps (reference, parameters) to every value of the subproblem, and its
 reverse-mode derivative is the vector-Jacobian product of eq. d3, second derivatives included.
@@ -17,6 +17,7 @@ from dscp_core.cone.convexity import NotConvexError
 from dscp_core.cone.program import ConePattern, ConeValues
 from dscp_core.errors import InvalidInputError
 from dscp_core.problem.declaration import TERMINAL_TIME, OptimalControlProblem, named
+from dscp_core.problem.flight import ControlHold, Discretisation
 from dscp_core.problem.parameters import ParameterTable
 from dscp_core.problem.tracing import Tracer
 from dscp_core.transcription import faults
@@ -47,6 +48,8 @@ class Transcription:
 
     Attributes:
         problem: The declaration.
+        discretisation: Dynamics of the intervals.
+        hold: How the controls are flown.
         layout: Where quantities stand in the decision vector.
         pattern: Fixed sparsity of every subproblem.
         costs: What the subproblems minimise of the true costs.
@@ -60,6 +63,8 @@ class Transcription:
         intervals: int,
         *,
         free_terminal_time: bool | None = None,
+        discretisation: Discretisation = Discretisation.MIDPOINT,
+        hold: ControlHold = ControlHold.MEAN,
     ) -> None:
         """Compile the problem's functions.
 
@@ -68,6 +73,8 @@ class Transcription:
             intervals: Number N of intervals.
             free_terminal_time: Make the terminal time a decision; the parameter
                 ``terminal_time`` is then its first guess only. None for the problem's default.
+            discretisation: Dynamics of the intervals.
+            hold: How the controls are flown, which propagated dynamics follow.
 
         Raises:
             InvalidInputError: ``intervals`` below 2, or a function of the declaration is wrong.
@@ -87,7 +94,9 @@ class Transcription:
             ),
             virtual_scale=np.array(problem.virtual_control_scale or (0.0,) * len(problem.states)),
         )
-        stages = build_stages(problem, self.layout)
+        self.discretisation = discretisation
+        self.hold = hold
+        stages = build_stages(problem, self.layout, discretisation, hold)
         scatter = ValueScatter(problem, self.layout, stages)
         self.pattern: ConePattern = scatter.pattern
         self.costs: CostAnalysis = stages.costs
@@ -104,7 +113,8 @@ class Transcription:
     def __reduce__(self) -> tuple[Any, ...]:
         """By what it was made of; the copy compiles its own functions."""
         free = self.layout.free_terminal_time
-        return _transcribed, (self.problem, self.layout.intervals, free)
+        given = (self.problem, self.layout.intervals, free, self.discretisation, self.hold)
+        return _transcribed, given
 
     def _compile(self, stages: StageFunctions, scatter: ValueScatter) -> None:
         layout = self.layout
@@ -274,6 +284,16 @@ class Transcription:
 
 
 def _transcribed(
-    problem: OptimalControlProblem, intervals: int, free_terminal_time: bool
+    problem: OptimalControlProblem,
+    intervals: int,
+    free_terminal_time: bool,
+    discretisation: Discretisation,
+    hold: ControlHold,
 ) -> Transcription:
-    return Transcription(problem, intervals, free_terminal_time=free_terminal_time)
+    return Transcription(
+        problem,
+        intervals,
+        free_terminal_time=free_terminal_time,
+        discretisation=discretisation,
+        hold=hold,
+    )

@@ -176,6 +176,8 @@ class StateEvaluator:
             self._problem,
             planner.intervals,
             free_terminal_time=planner.terminal_time is TerminalTime.FREE,
+            discretisation=planner.discretisation,
+            hold=planner.hold,
         )
         self._loss = model.loss.make(self._transcription, planner)
         self._verifier = PlanVerifier(self._problem, planner.intervals, hold=planner.hold)

@@ -298,6 +298,7 @@ def _identity(
         "intervals": planner.intervals,
         "terminal_time": planner.terminal_time.value,
         "hold": planner.hold.value,
+        "discretisation": planner.discretisation.value,
         "options": _json(replace(planner.options, deadline_s=None)),
         "tuned": [_json(quantity) for quantity in settings.tuned],
         "loss": settings.loss if loss.function is None else loss.function.sha256,

@@ -57,6 +57,20 @@ def add_case_arguments(parser: argparse.ArgumentParser) -> None:
         "own)",
     )
     group.add_argument(
+        "--hold",
+        choices=("mean", "linear"),
+        default="mean",
+        help="how the controls are flown between the nodes: constant at the mean of both (default) "
+        "or linear",
+    )
+    group.add_argument(
+        "--discretisation",
+        choices=("propagated", "midpoint"),
+        default="propagated",
+        help="dynamics of the intervals: those that are flown (default), or the paper's midpoint "
+        "rule",
+    )
+    group.add_argument(
         "--solver",
         metavar="NAME[,NAME]",
         help="clarabel (default), qoco, ecos, or several to try in this order",
@@ -133,6 +147,8 @@ def case_planner(args: argparse.Namespace, options: ScpOptions) -> Planner:
         parameters=overrides(args, problem),
         intervals=intervals,
         terminal_time=TerminalTime.FREE if free else TerminalTime.FIXED,
+        hold=args.hold,
+        discretisation=args.discretisation,
         options=options,
     )
     return Planner(problem, settings)

@@ -15,7 +15,7 @@ from dscp_core.cone.solvers import SOLVER_NAMES
 from dscp_core.errors import InvalidInputError
 from dscp_core.planning.planner import PlannerSettings, TerminalTime
 from dscp_core.problem.declaration import OptimalControlProblem
-from dscp_core.problem.flight import ControlHold
+from dscp_core.problem.flight import ControlHold, Discretisation
 from dscp_core.scp.scp import ScpOptions
 from dscp_ros.planner.declaration import VEHICLE_PREFIX, NodeParameter, Value
 from dscp_ros.planner.input_checks import InputSettings
@@ -126,7 +126,8 @@ def node_settings(problem: OptimalControlProblem, values: Mapping[str, Any]) -> 
             parameters=vehicle,
             intervals=values["intervals"],
             terminal_time=TerminalTime(values["terminal_time_source"]),
-            hold=ControlHold(values["certificate_hold"]),
+            hold=ControlHold(values["control_hold"]),
+            discretisation=Discretisation(values["discretisation"]),
             options=ScpOptions(
                 max_iterations=values["max_iterations"],
                 cost_tolerance=values["cost_tolerance"],
@@ -210,10 +211,16 @@ _PLANNING = (
         1.0,
     ),
     NodeParameter(
-        "certificate_hold",
+        "control_hold",
         ControlHold.MEAN.value,
-        "How the certificate flies the controls between nodes.",
+        "How the controls are flown between nodes.",
         choices=tuple(hold.value for hold in ControlHold),
+    ),
+    NodeParameter(
+        "discretisation",
+        Discretisation.PROPAGATED.value,
+        "Dynamics of the intervals: those that are flown, or the paper's midpoint rule.",
+        choices=tuple(rule.value for rule in Discretisation),
     ),
 )
 

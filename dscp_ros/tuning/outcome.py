@@ -22,7 +22,8 @@ _PLANNING = (
     "cost_tolerance",
     "defect_tolerance",
     "virtual_control_tolerance",
-    "certificate_hold",
+    "control_hold",
+    "discretisation",
 )
 
 

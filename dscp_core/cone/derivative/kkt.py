@@ -8,15 +8,21 @@ symbolic factorisation are done once per pattern.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 import qdldl
 import scipy.sparse as sp
+import scipy.sparse.linalg
 from numpy.typing import NDArray
 
 from dscp_core.cone.derivative.active_set import ActiveSet, ConeFrame, ConeRows, IndexArray
 from dscp_core.cone.program import ConePattern, ConeValues, FloatArray
+
+_LARGEST_GROWTH = 1e-3
+"""Largest relative residual of a solve, which refinement multiplies the error by."""
 
 
 @dataclass(frozen=True)
@@ -121,6 +127,7 @@ class KktMatrix:
         sample[self._diagonal_cells[self._first_cone_slot :]] = -1.0
         self._factored.data = sample
         self._factor = qdldl.Solver(self._factored, upper=True)
+        self._solve: Callable[[FloatArray], FloatArray] = self._factor.solve
 
     def update(
         self,
@@ -201,6 +208,25 @@ class KktMatrix:
         regularised[self._diagonal_cells] += self._regularisation
         self._factored.data = regularised
         self._factor.update(self._factored, upper=True)
+        self._solve = self._factor.solve
+        if not self._is_accurate():
+            self._solve = self._pivoted() or self._solve
+
+    def _is_accurate(self) -> bool:
+        """Whether refinement by the factors converges: without pivots they may have grown."""
+        solved = self._factor.solve(self._probe_vector)
+        defect = self.times(solved) + self._regularisation * solved - self._probe_vector
+        return bool(np.abs(defect).max() <= _LARGEST_GROWTH)  # False for NaN too
+
+    def _pivoted(self) -> Callable[[FloatArray], FloatArray] | None:
+        """A slower solve with the same regularised matrix, or None where it is singular."""
+        try:
+            factor = scipy.sparse.linalg.splu(
+                sp.csc_array(self._full + sp.diags_array(self._regularisation))
+            )
+        except RuntimeError:
+            return None
+        return cast("Callable[[FloatArray], FloatArray]", factor.solve)
 
     def times(self, x: FloatArray) -> FloatArray:
         """(size,) product with the assembled matrix, without regularisation."""
@@ -208,8 +234,8 @@ class KktMatrix:
 
     def probe(self) -> Conditioning:
         """Conditioning of the factored matrix, by two solves."""
-        first = self._factor.solve(self._probe_vector)
-        growth = float(np.linalg.norm(self._factor.solve(first / np.linalg.norm(first))))
+        first = self._solve(self._probe_vector)
+        growth = float(np.linalg.norm(self._solve(first / np.linalg.norm(first))))
         largest = float(np.abs(self._values).max())
         return Conditioning(largest * growth, self._strength * growth)
 
@@ -227,13 +253,13 @@ class KktMatrix:
         scale = float(np.abs(right).max())
         if scale == 0.0:
             return np.zeros(self.size), 0.0
-        best = self._factor.solve(right)
+        best = self._solve(right)
         defect = right - self.times(best)
         best_residual = float(np.abs(defect).max()) / scale
         for _ in range(self._max_refinements):
             if best_residual <= tolerance:
                 break
-            candidate = best + self._factor.solve(defect)
+            candidate = best + self._solve(defect)
             defect = right - self.times(candidate)
             residual = float(np.abs(defect).max()) / scale
             if not residual < best_residual:

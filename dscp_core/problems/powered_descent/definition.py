@@ -29,6 +29,7 @@ from dscp_core.problem.declaration import (
     Where,
 )
 from dscp_core.problem.extras import Extras
+from dscp_core.problem.flight import ControlHold
 from dscp_core.problems.loading import ProblemFamily
 from dscp_core.problems.powered_descent.figure import descent_figure
 from dscp_core.problems.powered_descent.guess import norm, projected_guess, raw_guess
@@ -249,7 +250,11 @@ def powered_descent(formulation: Formulation = Formulation.CONVERGENT) -> Optima
         cost_unit="kg",
         cost_scale=_COST_KG,
         cost_terms=(
-            CostTerm("mass_flow_curvature", _mass_flow_curvature, Where.MEAN),
+            CostTerm("mass_flow_curvature", _mass_flow_curvature, Where.MEAN, ControlHold.MEAN),
+            # The curvature between the nodes is at most the mean of that at both.
+            CostTerm(
+                "nodal_mass_flow_curvature", _mass_flow_curvature, Where.NODE, ControlHold.LINEAR
+            ),
             CostTerm(THRUST_PROX, _thrust_prox, Where.NODE),
         ),
         path_constraints=(_THRUST_FLOOR, _MEAN_THRUST_FLOOR),

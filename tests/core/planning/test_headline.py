@@ -21,7 +21,7 @@ def test_a_certified_converged_plan_says_both() -> None:
     assert outcome.certified
     assert outcome.converged
     assert outcome.headline == (
-        "certified, converged: terminal time 32.81 s (fixed), cost -31760.3 kg"
+        "certified, converged: terminal time 32.81 s (fixed), cost -31760.37 kg"
     )
 
 

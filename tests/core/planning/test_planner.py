@@ -16,7 +16,7 @@ from dscp_core.cone.solvers import SolverSettings
 from dscp_core.errors import InvalidInputError
 from dscp_core.planning.plan import PlanOutcome, PlanStatus
 from dscp_core.planning.planner import Planner, PlannerSettings, TerminalTime
-from dscp_core.problem.flight import ControlHold
+from dscp_core.problem.flight import ControlHold, Discretisation
 from dscp_core.problem.trajectory import Plan
 from dscp_core.scp.scp import ScpOptions
 
@@ -57,8 +57,8 @@ def test_nominal_plan_is_certified(fixed: Planner) -> None:
     assert outcome.terminal_time_used_s == 32.81
     assert outcome.terminal_time_predicted_s is None
     assert outcome.solver in ("clarabel", "qoco", "ecos")
-    # IPOPT finds 31760.299756 kg; relative 1e-6 of it.
-    assert outcome.cost == pytest.approx(-31760.299756, rel=1e-6)
+    # IPOPT finds 31760.299756 kg by the midpoint rule, whose own error is 2e-6 of it.
+    assert outcome.cost == pytest.approx(-31760.299756, rel=4e-6)
     assert outcome.virtual_control < 1e-6
     assert outcome.max_defect < 1e-6
     assert 0.0 < outcome.solver_time_s < outcome.solve_time_s
@@ -306,7 +306,8 @@ def test_iteration_limit_is_certified_by_the_flight_only() -> None:
 
 def test_converged_plan_may_fail_the_certificate() -> None:
     # Ten intervals are too coarse for the flight to end where the nodes do.
-    planner = Planner(problems.get("powered_descent"), PlannerSettings(intervals=10))
+    settings = PlannerSettings(intervals=10, discretisation=Discretisation.MIDPOINT)
+    planner = Planner(problems.get("powered_descent"), settings)
     outcome = planner.plan(START)
     assert outcome.status is PlanStatus.NOT_CERTIFIED
     assert outcome.certificate is not None

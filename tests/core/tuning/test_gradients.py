@@ -15,7 +15,7 @@ from dscp_core import problems
 from dscp_core.planning.certificate import PlanVerifier
 from dscp_core.planning.planner import PlannerSettings, TerminalTime
 from dscp_core.problem.declaration import TERMINAL_TIME, OptimalControlProblem
-from dscp_core.problem.flight import ControlHold
+from dscp_core.problem.flight import ControlHold, Discretisation
 from dscp_core.scp.scp import Scp, ScpOptions
 from dscp_core.transcription.transcription import Transcription
 from dscp_core.tuning.choice import cost_is_minus_mass
@@ -59,14 +59,17 @@ class Case:
     problem: OptimalControlProblem = field(default_factory=lambda: problems.get("powered_descent"))
 
 
+# Propagated plans miss by rounding, which has no derivative.
+MISSING = replace(FIXED, discretisation=Discretisation.MIDPOINT)
+
 CASES = {
     "parameter fuel": Case("thrust_max=7e5:9e5", "fuel", FIXED, 6, 1e-3, 1e-6),
     "parameter cost free time": Case("thrust_max=7e5:9e5", "cost", FREE, 6, 1e-4, 1e-5),
-    "parameters miss": Case("specific_impulse=250:300", "miss", FIXED, 6, 1e-3, 1e-6),
+    "parameters miss": Case("specific_impulse=250:300", "miss", MISSING, 6, 1e-3, 1e-6),
     "time miss linear": Case(
         "terminal_time=34:38",
         "miss",
-        support.planner(intervals=12, hold=ControlHold.LINEAR),
+        replace(MISSING, hold=ControlHold.LINEAR),
         6,
         1e-3,
         1e-6,
@@ -82,7 +85,7 @@ CASES = {
     "weight iterations": Case(
         "trust_region_control.thrust_y", "iterations", FIXED, 5, 1e-3, 1e-5, PRINTED
     ),
-    "step weight cost": Case("trust_region_step@10", "cost", FREE, 3, 1e-3, 1e-5),
+    "step weight cost": Case("trust_region_step@10", "cost", FREE, 3, 1e-3, 1e-4),
     "virtual weight convergence": Case(
         "virtual_control_weight", "convergence", SOFT, 3, 1e-2, 1e-4
     ),
@@ -150,7 +153,7 @@ def test_every_kind_of_quantity_and_loss(name: str, tmp_path: Path) -> None:
     assert along == pytest.approx(difference(value, case.step), rel=case.tolerance)
 
 
-TIGHT = ScpOptions(cost_tolerance=1e-10, max_iterations=60)
+TIGHT = ScpOptions(cost_tolerance=1e-9, max_iterations=60)
 
 
 @pytest.mark.parametrize(
@@ -178,7 +181,7 @@ def test_envelope(tuned: str, loss: str, planner: PlannerSettings) -> None:
     def value(size: float) -> float:
         return objective.evaluate(start + size * step, states).loss
 
-    # Runs end within 1e-10 of the optimal cost, which leaves 1e-4 of its difference.
+    # Runs end within 1e-9 of the optimal cost, which leaves 1e-3 of its difference.
     assert float(found.gradient @ step) == pytest.approx(difference(value, 1.0), rel=1e-3)
 
 
