@@ -188,7 +188,7 @@ def check_against_ipopt(
     best = Outcome.join(list(engine.map(best_time_jobs(states, TRUTH))))
     problem = model.problem
     base = problem.table.pack(model.parameters)
-    program = NonlinearProgram(problem, model.intervals)
+    program = NonlinearProgram(problem, model.intervals, base)
     times, masses = np.full(len(states), np.nan), np.full(len(states), np.nan)
     for row, state in enumerate(states):
         packed = problem.table.pack(

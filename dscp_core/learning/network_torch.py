@@ -116,7 +116,7 @@ class TorchNetwork(torch.nn.Module):
         *,
         lower: Array,
         upper: Array,
-        vehicle: Mapping[str, float | list[float]],
+        vehicle: Mapping[str, Any],
         intervals: int,
         provenance: Mapping[str, Any],
     ) -> NetworkData:

@@ -22,6 +22,8 @@ from dscp_core.problem.declaration import (
     Where,
     named,
 )
+from dscp_core.problem.flight import ControlHold
+from dscp_core.transcription.imposed import held, imposed
 from dscp_core.transcription.layout import TrajectoryLayout
 from dscp_core.transcription.transcription import Transcription
 
@@ -46,13 +48,15 @@ _STARTS = 4
 class NonlinearProgram:
     """The problem with free terminal time as one nonlinear program."""
 
-    def __init__(self, problem: OptimalControlProblem, intervals: int) -> None:
+    def __init__(self, problem: OptimalControlProblem, intervals: int, parameters: Array) -> None:
         """Build the solver.
 
         Args:
             problem: Its declaration.
-            intervals: Number of intervals.
+            intervals: Number of intervals, over which controls are held at their means.
+            parameters: Packed, SI; what has no bound with these is left out.
         """
+        problem = held(imposed(problem, parameters), ControlHold.MEAN)
         self._transcription = Transcription(problem, intervals, free_terminal_time=True)
         layout = self._transcription.layout
         z = ca.SX.sym("z", layout.reference_size)
@@ -74,9 +78,8 @@ class NonlinearProgram:
         inequalities = []
         for constraint in (*problem.path_constraints, *problem.cone_constraints):
             places = points if constraint.where is Where.NODE else means
-            last = len(places) - int(constraint.skip_last)
-            for place in places[int(constraint.skip_first) : last]:
-                inequalities += _inequalities(constraint, place, p)
+            for place in constraint.places(len(places)):
+                inequalities += _inequalities(constraint, places[place], p)
         cost = self._transcription.cost_function(z, packed)
         equal, unequal = ca.vertcat(*equalities), ca.vertcat(*inequalities)
         self._bounds = {

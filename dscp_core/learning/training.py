@@ -148,9 +148,7 @@ def _stages(run: Run) -> None:
     stage(run, "stochastic", "done", take_stochastic_steps)
 
 
-def _finish(
-    run: Run, settings: TrainingSettings, vehicle: Mapping[str, float | list[float]]
-) -> TrainingResult:
+def _finish(run: Run, settings: TrainingSettings, vehicle: Mapping[str, Any]) -> TrainingResult:
     errors = run.validate()
     lower, upper = PAPER_BOX.widened(settings.recipe.widening).bounds(MASS_TOLERANCE)
     data = run.network.export(

@@ -1,39 +1,36 @@
 """Independent check of a plan: the true dynamics flown under the planned controls.
 
-The plan satisfies the *discrete* dynamics at the nodes; whether it can be flown is decided here,
-by a variable-order integration (scipy's LSODA, up to order 12) with an error control far below
-what is certified, and by the constraints between the nodes.
+The plan satisfies the *discrete* dynamics at the nodes; whether it can be flown is decided here, by
+Dormand-Prince steps with an error estimate far below what is certified. Limits are checked at their
+peaks between the nodes, and a flight ends where the problem's end event, such as contact with the
+ground, ends it.
 """
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import partial
 
 import casadi as ca
 import numpy as np
-import scipy.integrate
 from numpy.typing import NDArray
 
 from dscp_core.errors import InvalidInputError
+from dscp_core.planning.extremes import Piece, highest, peak_bounds
+from dscp_core.planning.flying import Flown, Pilot
+from dscp_core.planning.limits import Limit, Limits
 from dscp_core.problem.checks import not_negative
-from dscp_core.problem.declaration import (
-    Constraint,
-    OptimalControlProblem,
-    PathConstraint,
-    StagePoint,
-    Where,
-    named,
-)
+from dscp_core.problem.declaration import OptimalControlProblem, named
 from dscp_core.problem.flight import ControlHold
-from dscp_core.problem.tracing import Tracer
+from dscp_core.problem.tracing import Tracer, known_values
 from dscp_core.transcription.compiled import CompiledFunction
-from dscp_core.transcription.stages import constraints
 
 Array = NDArray[np.float64]
 
-_INTEGRATED = "Integration successful."  # odeint's word; it has no status code
+_RESOLUTION, _LEAST_RESOLUTION = 1e-3, 1e-6
+"""How exactly a peak is known: to this part of its margin, or of its bound, the larger one."""
+_ROUNDING = 1e-9
+"""The same at least, of a constraint's scale."""
 
 
 @dataclass(frozen=True)
@@ -56,6 +53,11 @@ class Check:
     time_s: float
     passed: bool
 
+    @property
+    def margin(self) -> float:
+        """What is left to the bound; negative where it is exceeded."""
+        return self.bound - self.worst_value
+
 
 @dataclass(frozen=True)
 class PlanCertificate:
@@ -64,22 +66,40 @@ class PlanCertificate:
     Attributes:
         passed: Whether every check passed.
         reasons: What failed, with value and bound; empty when passed.
-        checks: Every check, misses first.
-        times_s: (M,) fine grid.
+        checks: Every check, those of the end first.
+        unchecked: Names of constraints that are not imposed, their bound being unknown or infinite.
+        times_s: (M,) fine grid, to the end of the flight.
         states: (M, nx) integrated states, SI.
         controls: (M, nu) controls as flown, SI.
         hold: How the controls were flown.
-        mass_used_kg: Mass lost in flight, or None for a vehicle whose mass is no state.
+        contact_time_s: When the end event, such as contact, ended the flight; None where it did
+            not, or where the problem has none.
+        mass_used_kg: Mass lost in flight, or None where the problem names no propellant.
+        propellant_left_kg: Mass above the dry mass at the end, or None where that is not known.
     """
 
     passed: bool
     reasons: tuple[str, ...]
     checks: tuple[Check, ...]
+    unchecked: tuple[str, ...]
     times_s: Array
     states: Array
     controls: Array
     hold: ControlHold
+    contact_time_s: float | None
     mass_used_kg: float | None
+    propellant_left_kg: float | None
+
+    def check(self, name: str) -> Check:
+        """A check by name.
+
+        Raises:
+            InvalidInputError: No such check.
+        """
+        for check in self.checks:
+            if check.name == name:
+                return check
+        raise InvalidInputError("check", name, f"one of {', '.join(c.name for c in self.checks)}")
 
     def value(self, name: str) -> float:
         """Worst value of a check by name.
@@ -87,10 +107,7 @@ class PlanCertificate:
         Raises:
             InvalidInputError: No such check.
         """
-        for check in self.checks:
-            if check.name == name:
-                return check.worst_value
-        raise InvalidInputError("check", name, f"one of {', '.join(c.name for c in self.checks)}")
+        return self.check(name).worst_value
 
     @property
     def miss_position_m(self) -> float:
@@ -116,63 +133,39 @@ class PlanVerifier:
         *,
         substeps: int = 4,
         hold: ControlHold = ControlHold.MEAN,
-        relative_tolerance: float = 1e-12,
     ) -> None:
         """Compile dynamics and constraints.
 
         Args:
             problem: The declaration.
             intervals: Number N of intervals of the plans.
-            substeps: Points of the fine grid per interval.
+            substeps: Steps of the flight per interval; more where the error asks for it.
             hold: How the controls are flown.
-            relative_tolerance: Of the integrator.
         """
         self._problem = problem
-        self._intervals = intervals
-        self._substeps = substeps
         self._hold = hold
-        self._relative_tolerance = relative_tolerance
         nx, nu = len(problem.states), len(problem.controls)
         x, u = ca.SX.sym("x", nx), ca.SX.sym("u", nu)
         packed = ca.SX.sym("p", problem.table.size)
-        parameters = named(problem, packed)
         trace = Tracer(problem.table, x, u, packed)
-        self._scale = np.array([s.scale for s in problem.states])
-        # Scaled, so that one tolerance suits every state.
-        state = x * ca.DM(self._scale)
-        rates = trace("dynamics", problem.dynamics, state, u, parameters, rows=nx)
-        scaled_rates = rates / ca.DM(self._scale)
-        self._rates = CompiledFunction("rates", [x, u, packed], [scaled_rates])
-        # Along the flight there is no difference between nodes and interval means.
-        self._checked = tuple(c for where in Where for c in constraints(problem, where))
-        step = ca.SX.sym("T")
-        point = StagePoint(x, u, step)
-        trace = Tracer(problem.table, x, u, step, packed)
-        limits = ca.Function(
-            "limits",
-            [x, u, ca.vertcat(step, packed)],
-            [_stack(_violation(c, trace, point, parameters) for c in self._checked)],
-        )
-        self._points = intervals * substeps + 1
-        grid = [ca.MX.sym("x", nx, self._points), ca.MX.sym("u", nu, self._points)]
-        grid.append(ca.MX.sym("T_p", 1 + problem.table.size))
-        mapped = limits.map("limits_on_grid", "serial", self._points, [2], [])
-        self._limits = CompiledFunction("limits_on_grid", grid, [mapped(*grid)])
-        self._misses = CompiledFunction(
-            "misses",
-            [x, packed],
-            [
-                _stack(
-                    trace(f"miss {m.name}", m.expression, x, parameters) for m in problem.end_checks
-                )
-            ],
-        )
+        rates = trace("dynamics", problem.dynamics, x, u, named(problem, packed), rows=nx)
+        self._rates = CompiledFunction("rates", [x, u, packed], [rates])
+        self._limits = Limits(problem)
+        self._pilot = Pilot(problem, self._limits, intervals, substeps, hold)
 
     def rates(self, states: Array, controls: Array, parameters: Array) -> Array:
         """Time derivative of the states at every node, (N+1, nx), SI."""
-        pairs = zip(states / self._scale, controls, strict=True)
-        scaled = np.array([self._rates(x, u, parameters)[0] for x, u in pairs])
-        return np.asarray(scaled * self._scale)
+        pairs = zip(states, controls, strict=True)
+        return np.array([self._rates(x, u, parameters)[0] for x, u in pairs])
+
+    def require_checkable(self, parameters: Array) -> None:
+        """Refuse packed parameters, SI, for which there can be no certificate.
+
+        Raises:
+            InvalidInputError: A tolerance is no number, or the hold contradicts a limit.
+        """
+        self._limits.bounds(known_values(self._problem.table, parameters))
+        self._limits.require_hold(parameters, self._hold)
 
     def certify(
         self, times_s: Array, states: Array, controls: Array, parameters: Array
@@ -184,123 +177,107 @@ class PlanVerifier:
             states: (N+1, nx) planned states, SI; only the first is flown from.
             controls: (N+1, nu) planned controls, SI.
             parameters: Packed parameters, SI.
+
+        Raises:
+            InvalidInputError: As `require_checkable`.
         """
-        with warnings.catch_warnings():
-            # What it warns of is a reason of the certificate.
-            warnings.simplefilter("ignore", scipy.integrate.ODEintWarning)
-            flight, failure = self._fly(times_s, states[0], controls, parameters)
-        times, flown, applied = flight
-        checks: list[Check] = []
-        if failure is None:
-            missed = self._misses(flown[-1], parameters)[0]
-            for miss, value in zip(self._problem.end_checks, missed, strict=True):
-                check = _check(miss.name, value, miss.tolerance, miss.unit, times[-1])
-                checks.append(replace(check, passed=check.passed and check.worst_value >= 0.0))
-        step = float(times_s[-1] - times_s[0]) / self._intervals
-        values = self._limits_along(flown, applied, step, parameters)
-        table = self._problem.table
-        for column, constraint in enumerate(self._checked):
-            worst = int(np.argmax(values[:, column]))
-            if np.isneginf(values[worst, column]):
-                continue  # its bound is infinite: it is not imposed
-            bound = constraint.accepted(table, parameters)
-            not_negative(f"tolerance of constraint {constraint.name}", bound)
-            worst_value = values[worst, column]
-            checks.append(
-                _check(constraint.name, worst_value, bound, constraint.unit, times[worst])
-            )
+        values = known_values(self._problem.table, parameters)
+        bounds = self._limits.bounds(values)
+        self._limits.require_hold(parameters, self._hold)
+        flown = self._pilot.fly(times_s, states[0], controls, parameters, values)
+        flight = flown.flight
+        found = [*self._at_end(flown, parameters), *self._along(flown, bounds, parameters)]
+        # At minus infinity its bound is unknown or infinite: it is not imposed.
+        unchecked = [limit.name for limit, value, _ in found if np.isneginf(value)]
+        checks = [
+            _check(limit, worst, bounds[limit.name], when)
+            for limit, worst, when in found
+            if limit.name not in unchecked
+        ]
         reasons = [_reason(check) for check in checks if not check.passed]
-        if failure is not None:
-            reasons.insert(0, failure)
-        names = [s.name for s in self._problem.states]
-        used = None
-        if "mass" in names:
-            used = float(flown[0, names.index("mass")] - flown[-1, names.index("mass")])
+        if flown.failure is not None:
+            reasons.insert(0, flown.failure)
+        used, left = self._propellant(flight.states, parameters)
         return PlanCertificate(
             passed=not reasons,
             reasons=tuple(reasons),
             checks=tuple(checks),
-            times_s=times,
-            states=flown,
-            controls=applied,
+            unchecked=tuple(unchecked),
+            times_s=flight.times_s,
+            states=flight.states,
+            controls=flown.controls,
             hold=self._hold,
+            contact_time_s=flown.event_s,
             mass_used_kg=used,
+            propellant_left_kg=left,
         )
 
-    def require_tolerances(self, parameters: Array) -> None:
-        """Raise `InvalidInputError` for a tolerance that packed parameters, SI, make no number."""
-        for constraint in self._checked:
-            constraint.accepted(self._problem.table, parameters)
+    def _at_end(self, flown: Flown, packed: Array) -> list[tuple[Limit, float, float]]:
+        """Limits of the end of a flight, with value and time."""
+        if flown.failure is not None:
+            return []
+        end_s, end = float(flown.flight.times_s[-1]), flown.flight.states[-1]
+        found = self._limits.ends(end, flown.control, flown.change, flown.interval_s, packed)
+        skipped = () if flown.meant else self._limits.at_event
+        return [(limit, value, end_s) for limit, value in found if limit not in skipped]
 
-    def _limits_along(self, flown: Array, applied: Array, step: float, parameters: Array) -> Array:
-        """Violation of every constraint at every point, (M, constraints)."""
-        # A flight that ended early is filled up with its last point.
-        index = np.minimum(np.arange(self._points), len(flown) - 1)
-        known = np.append(step, parameters)
-        violations = self._limits(flown[index].ravel(), applied[index].ravel(), known)[0]
-        return violations.reshape(self._points, -1)[: len(flown)]
+    def _along(
+        self, flown: Flown, bounds: dict[str, float], packed: Array
+    ) -> list[tuple[Limit, float, float]]:
+        """Limits of the way, with the worst value and its time."""
+        flight, found = flown.flight, []
+        lengths = flight.steps.lengths_s
+        if not lengths.size:
+            return []
+        low, high = flight.left[0], flight.right[0]
+        # A rate may not exist at a point, such as that of a norm at zero; the value counts there.
+        rates = [np.nan_to_num(s[1], posinf=0.0, neginf=0.0) for s in (flight.left, flight.right)]
+        reach = peak_bounds(low, high, rates[0], rates[1], lengths[:, None])
+        firsts, seconds = low.argmax(axis=0), high.argmax(axis=0)
+        for channel, limit in enumerate(self._limits.along):
+            first, second = firsts[channel], seconds[channel]
+            worst, when = float(low[first, channel]), float(flight.times_s[first])
+            if not high[second, channel] <= worst:
+                worst, when = float(high[second, channel]), float(flight.times_s[second + 1])
+            resolution = partial(_resolution, limit, bounds[limit.name])
+            peaks = np.flatnonzero(reach[:, channel] > worst + resolution(worst))
+            if peaks.size:
+                starts, ends = (low, rates[0]), (high, rates[1])
+                pieces = []
+                for step in peaks:
+                    y0, d0 = (float(side[step, channel]) for side in starts)
+                    y1, d1 = (float(side[step, channel]) for side in ends)
+                    piece = Piece(0.0, float(lengths[step]), (y0, d0), (y1, d1))
+                    pieces.append((piece, self._pilot.within(flown, int(step), channel, packed)))
+                worst, after, which = highest(pieces, worst, resolution)
+                if which >= 0:
+                    when = float(flight.times_s[peaks[which]] + after)
+            found.append((limit, worst, when))
+        return found
 
-    def _fly(
-        self, times_s: Array, start: Array, controls: Array, parameters: Array
-    ) -> tuple[tuple[Array, Array, Array], str | None]:
-        """Fine grid with states and controls, and why the integration ended early."""
-        grid, flown, applied = [times_s[:1]], [start[None, :] / self._scale], []
-        for n in range(self._intervals):
-            # Restarted at every node: the controls or their rates jump there.
-            origin, end = times_s[n], times_s[n + 1]
-            if self._hold is ControlHold.MEAN:
-                held, slope = 0.5 * (controls[n] + controls[n + 1]), np.zeros(controls.shape[1])
-            else:
-                held, slope = controls[n], (controls[n + 1] - controls[n]) / (end - origin)
-            moments = np.linspace(origin, end, self._substeps + 1)
-            applied.append(held + np.outer(moments[:-1] - origin, slope))
-            reached, details = scipy.integrate.odeint(
-                self._right_hand_side(origin, held, slope, parameters),
-                flown[-1][-1],
-                moments,
-                rtol=self._relative_tolerance,
-                atol=self._relative_tolerance,
-                full_output=True,
-            )
-            if details["message"] != _INTEGRATED or not np.all(np.isfinite(reached)):
-                failure = f"integration ended before {end:.3f} s: {details['message']}"
-                return _stacked(grid, flown, applied, self._scale), failure
-            grid.append(moments[1:])
-            flown.append(reached[1:])
-        applied.append((held + (times_s[-1] - origin) * slope)[None, :])
-        return _stacked(grid, flown, applied, self._scale), None
-
-    def _right_hand_side(
-        self, origin: float, held: Array, slope: Array, parameters: Array
-    ) -> Callable[[Array, float], Array]:
-        """Scaled rates of (state, time) on one interval."""
-        if not slope.any():
-            rates = self._rates.of_first(held, parameters)
-            return lambda x, _t: rates(x)
-        return lambda x, t: self._rates(x, held + (t - origin) * slope, parameters)[0]
-
-
-def _stacked(
-    grid: list[Array], flown: list[Array], applied: list[Array], scale: Array
-) -> tuple[Array, Array, Array]:
-    times, states = np.concatenate(grid), np.vstack(flown) * scale
-    return times, states, np.vstack(applied)[: times.size]
+    def _propellant(self, flown: Array, packed: Array) -> tuple[float | None, float | None]:
+        """Mass burnt over flown states (M, nx), and what is left above the dry mass."""
+        declared, table = self._problem.propellant, self._problem.table
+        if declared is None:
+            return None, None
+        mass = flown[:, [s.name for s in self._problem.states].index(declared.mass)]
+        used = float(mass[0] - mass[-1])
+        if declared.dry_mass is None:
+            return used, None
+        dry = float(packed[table.slice(declared.dry_mass)][0])
+        return used, float(mass[-1]) - dry if dry > 0.0 else None
 
 
-def _stack(scalars: Iterable[ca.SX]) -> ca.SX:
-    return ca.vertcat(*scalars, ca.SX(0, 1))
+def _resolution(limit: Limit, bound: float, worst: float) -> float:
+    """How exactly a worst value has to be known."""
+    return max(_RESOLUTION * abs(bound - worst), _LEAST_RESOLUTION * bound, _ROUNDING * limit.scale)
 
 
-def _violation(
-    constraint: Constraint, trace: Tracer, point: StagePoint, parameters: dict[str, ca.SX]
-) -> ca.SX:
-    linear = isinstance(constraint, PathConstraint)
-    what = f"constraint {constraint.name}"
-    rows = 1 if linear else None
-    value = trace(what, constraint.expression, point, parameters, rows=rows)
-    if linear:
-        return value
-    return ca.norm_2(value[1:]) - value[0]
+def _check(limit: Limit, value: float, bound: float, time_s: float) -> Check:
+    worst = float(value)
+    not_negative(limit.what, bound)
+    passed = worst <= bound and not (limit.distance and worst < 0.0)
+    return Check(limit.name, worst, bound, limit.unit, time_s, bool(passed))
 
 
 def _reason(failed: Check) -> str:
@@ -308,8 +285,3 @@ def _reason(failed: Check) -> str:
     if failed.worst_value <= failed.bound:
         return f"{text} is negative, so no distance from the target"
     return f"{text} exceeds {failed.bound:.4g}"
-
-
-def _check(name: str, value: float, bound: float, unit: str, time_s: float) -> Check:
-    worst = float(value)
-    return Check(name, worst, bound, unit, float(time_s), bool(worst <= bound))

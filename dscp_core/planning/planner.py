@@ -108,7 +108,7 @@ class Planner:
         # Where the predictor does not help; compiled now, as no deadline has time for it.
         self._free = self.scp if predictor is None else self._loop(free=True)
         self._verifier = PlanVerifier(self.problem, settings.intervals, hold=settings.hold)
-        self._verifier.require_tolerances(self.parameters)
+        self._verifier.require_checkable(self.parameters)
         self._time = self.problem.table.slice(TERMINAL_TIME)
         self._time_bounds = self._bounds_of_time()
 

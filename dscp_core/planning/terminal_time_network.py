@@ -91,7 +91,7 @@ class NetworkData:
     interval_s: tuple[float, float]
     lower: Array
     upper: Array
-    vehicle: Mapping[str, float | list[float]]
+    vehicle: Mapping[str, Any]
     intervals: int
     provenance: Mapping[str, Any] = field(default_factory=dict)
 

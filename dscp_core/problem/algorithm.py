@@ -10,6 +10,14 @@ VIRTUAL_CONTROL_WEIGHT = "virtual_control_weight"
 TRUST_REGION_STATE = "trust_region_state"
 TRUST_REGION_CONTROL = "trust_region_control"
 TRUST_REGION_STEP = "trust_region_step"
+DERIVED_COSTS = (
+    "running_cost",
+    "terminal_cost",
+    "trust_region",
+    "trust_region_step",
+    "virtual_control",
+)
+"""Names of the costs of a subproblem that are no declared terms."""
 
 
 def algorithm_parameters(

@@ -24,6 +24,16 @@ def members(field: str, values: Any, kind: type) -> tuple[Any, ...]:
     return tuple(values)
 
 
+def optional(field: str, value: Any, kind: type) -> None:
+    """Refuse what is neither None nor of a type.
+
+    Raises:
+        InvalidInputError: With the value.
+    """
+    if value is not None and not isinstance(value, kind):
+        raise InvalidInputError(field, value, f"a {kind.__name__}, or None")
+
+
 def plain(what: str, declared: Any, **kinds: type) -> None:
     """Refuse texts, yes-or-no values and choices that are of another type.
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from dscp_core.errors import InvalidInputError
 from dscp_core.problem import checks
 from dscp_core.problem.algorithm import (
+    DERIVED_COSTS,
     TRUST_REGION_CONTROL,
     TRUST_REGION_STATE,
     TRUST_REGION_STEP,
@@ -34,9 +35,11 @@ from dscp_core.problem.elements import (
     Where,
     pinned_miss,
 )
+from dscp_core.problem.ending import EndEvent, EventLimit, Propellant
 from dscp_core.problem.extras import Extras
-from dscp_core.problem.parameters import Parameter, ParameterTable, Value, load_parameter_file
+from dscp_core.problem.parameters import Parameter, ParameterTable, Value, without_infinities
 from dscp_core.problem.tracing import KnownParameters, numeric
+from dscp_core.problem.vehicles import Reader, vehicle_values
 
 Symbol = TypeVar("Symbol", ca.SX, ca.MX)
 
@@ -50,11 +53,14 @@ __all__ = [
     "ConeConstraint",
     "Constraint",
     "CostTerm",
+    "EndEvent",
+    "EventLimit",
     "InitialGuess",
     "Miss",
     "OptimalControlProblem",
     "Parameters",
     "PathConstraint",
+    "Propellant",
     "Quadrature",
     "StagePoint",
     "Variable",
@@ -63,14 +69,6 @@ __all__ = [
 ]
 
 TERMINAL_TIME = "terminal_time"
-DERIVED_COSTS = (
-    "running_cost",
-    "terminal_cost",
-    "trust_region",
-    "trust_region_step",
-    "virtual_control",
-)
-"""Names of the costs of a subproblem that are no declared terms."""
 
 
 @dataclass(frozen=True)
@@ -119,6 +117,8 @@ class OptimalControlProblem:
             values, one after the other, are the states in order.
         vehicle_tables: What a vehicle file may name besides parameters: name to a function that
             reads the file it points to and returns parameter values.
+        file_defaults: Values of parameters that a vehicle file does not give: where the defaults
+            are facts about another vehicle.
         check_parameters: Raises `InvalidInputError` for values by name that contradict each other.
         check_state: Raises `InvalidInputError` for an initial state that no plan can start from;
             arguments are the states (nx,) and the parameters' values by name.
@@ -128,6 +128,8 @@ class OptimalControlProblem:
             none do.
         misses: Distances from the target that a certificate checks; empty for those of every
             pinned state, see `end_checks`.
+        end_event: What ends a flight whatever the plan says, such as contact with the ground.
+        propellant: What a flight burns.
         control_states: Index of the state that each control acts on (for named-vector messages).
         formulation: Which of several forms of the problem this is; empty where there is one.
         extras: What it brings along, such as a figure of its own.
@@ -186,14 +188,15 @@ class OptimalControlProblem:
     trust_region_step: float = 0.0
     trust_region_per_second: bool = False
     initial_state_parameters: tuple[str, ...] = ()
-    vehicle_tables: Mapping[str, Callable[[Path], Mapping[str, Value]]] = field(
-        default_factory=dict
-    )
+    vehicle_tables: Mapping[str, Reader] = field(default_factory=dict)
+    file_defaults: Mapping[str, Value] = field(default_factory=dict)
     check_parameters: Callable[[Mapping[str, Any]], None] | None = None
     check_state: Callable[[NDArray[np.float64], Mapping[str, Any]], None] | None = None
     terminal_time_guess: Callable[[NDArray[np.float64], Mapping[str, Any]], float] | None = None
     least_time_parameters: Mapping[str, float] = field(default_factory=dict)
     misses: tuple[Miss, ...] = ()
+    end_event: EndEvent | None = None
+    propellant: Propellant | None = None
     control_states: tuple[int, ...] = ()
     formulation: str = ""
     extras: Extras = field(default_factory=Extras)
@@ -201,6 +204,8 @@ class OptimalControlProblem:
 
     def __post_init__(self) -> None:
         checks.plain("", self, Quadrature=Quadrature, Extras=Extras)
+        for label, one in (("end_event", EndEvent), ("propellant", Propellant)):
+            checks.optional(label, getattr(self, label), one)
         checks.named("name", self.name)
         for label, kind in _MEMBERS.items():
             object.__setattr__(self, label, checks.members(label, getattr(self, label), kind))
@@ -241,7 +246,10 @@ class OptimalControlProblem:
     def _check_names(self) -> None:
         limits = [c.name for c in (*self.path_constraints, *self.cone_constraints)]
         checks.distinct("states and controls", (v.name for v in (*self.states, *self.controls)))
-        checks.distinct("constraints and misses", [*limits, *(m.name for m in self.end_checks)])
+        ends = [m.name for m in self.end_checks]
+        if self.end_event is not None:
+            ends += [self.end_event.floor, *(limit.name for limit in self.end_event.limits)]
+        checks.distinct("constraints and misses", [*limits, *ends])
         checks.distinct("constraints", limits, reserved=(TERMINAL_TIME,))
         checks.distinct("cost_terms", (t.name for t in self.cost_terms), reserved=DERIVED_COSTS)
         unknown = sorted(set(self.final_state) - {s.name for s in self.states}, key=str)
@@ -253,7 +261,7 @@ class OptimalControlProblem:
             raise InvalidInputError("control_states", acted_on, f"[0, {len(known) - 1}]")
 
     def _check_functions(self) -> None:
-        for label in ("final_state", "vehicle_tables", "least_time_parameters"):
+        for label in ("final_state", "vehicle_tables", "file_defaults", "least_time_parameters"):
             checks.mapping(label, getattr(self, label))
         given = {name: getattr(self, name) for name in (*_FUNCTIONS, *_OPTIONAL_FUNCTIONS)}
         given |= {f"final_state {name}": value for name, value in self.final_state.items()}
@@ -278,8 +286,10 @@ class OptimalControlProblem:
             raise InvalidInputError(
                 "initial_state_parameters", self.initial_state_parameters, bound
             )
-        for name, value in self.least_time_parameters.items():
+        for name, value in (*self.least_time_parameters.items(), *self.file_defaults.items()):
             self.table[name].validate(value)
+        if self.propellant is not None:
+            self.propellant.require_known([s.name for s in self.states], self.table)
 
     def __reduce__(self) -> tuple[Any, ...]:
         """By value, lambdas and closures included: workers get the problem itself."""
@@ -315,19 +325,7 @@ class OptimalControlProblem:
         Raises:
             InvalidInputError: The file or a table cannot be used, or both give a value.
         """
-        values: dict[str, Any] = dict(load_parameter_file(path))
-        for name, read in self.vehicle_tables.items():
-            if name not in values:
-                continue
-            table = values.pop(name)
-            if not isinstance(table, str):
-                raise InvalidInputError(name, table, "the name of a file beside the vehicle's")
-            found = read(Path(path).parent / table)
-            twice = sorted(set(found) & set(values))
-            if twice:
-                raise InvalidInputError(name, table, f"no {', '.join(twice)} beside it")
-            values.update(found)
-        return values
+        return vehicle_values(path, self.vehicle_tables, self.file_defaults)
 
     def initial_state_values(self, state: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
         """Values, by name, of the parameters that hold an initial state (nx,), SI."""
@@ -351,15 +349,17 @@ class OptimalControlProblem:
             if state.name in self.final_state
         )
 
-    def vehicle_of(self, values: Mapping[str, Any]) -> dict[str, float | list[float]]:
+    def vehicle_of(self, values: Mapping[str, Any]) -> dict[str, Any]:
         """The parameters that fix the optimum from a state, as JSON holds them.
+
+        A number, or a list of them; None stands for an infinite bound, which is none.
 
         Args:
             values: Every parameter by name, SI.
         """
         others = {TERMINAL_TIME, *self.initial_state_parameters}
         return {
-            p.name: np.asarray(values[p.name], dtype=np.float64).tolist()
+            p.name: without_infinities(np.asarray(values[p.name], dtype=np.float64).tolist())
             for p in self.table.parameters
             if p.fixes_optimum and p.name not in others
         }

@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import Enum
-from typing import Any
 
 import casadi as ca
-import numpy as np
-from numpy.typing import NDArray
 
+from dscp_core.errors import InvalidInputError
 from dscp_core.problem import checks
+from dscp_core.problem.ending import Tolerance, accepted_tolerance, require_tolerance
 from dscp_core.problem.flight import ControlHold
 from dscp_core.problem.parameters import ParameterTable
-from dscp_core.problem.tracing import numeric
+from dscp_core.problem.tracing import KnownParameters
 
 
 @dataclass(frozen=True)
@@ -82,6 +80,7 @@ class StagePoint:
         x: State, (nx, 1).
         u: Control, (nu, 1).
         step: Interval length T in seconds.
+        over_interval: Change of the control over the interval, (nu, 1); None at a node.
 
     Example:
         >>> import casadi as ca
@@ -94,6 +93,21 @@ class StagePoint:
     x: ca.SX
     u: ca.SX
     step: ca.SX
+    over_interval: ca.SX | None = None
+
+    @property
+    def u_change(self) -> ca.SX:
+        """Change of the control over the interval, (nu, 1): T times its rate if held linearly.
+
+        Plans whose controls are held at their means jump instead: there, a constraint with it is
+        left out of the subproblems, and refused by the planner unless its bound is infinite.
+
+        Raises:
+            InvalidInputError: At a node.
+        """
+        if self.over_interval is None:
+            raise InvalidInputError("u_change", "a node", "an interval: where=Where.MEAN")
+        return self.over_interval
 
 
 Parameters = Mapping[str, ca.SX]
@@ -113,7 +127,9 @@ class Constraint:
         unit: Unit of the expression.
         where: Node or interval mean.
         skip_first: Leave out the first node or interval (its state is pinned).
-        skip_last: Leave out the last node or interval.
+        skip_last: Number of last nodes or intervals to leave out.
+        only_last: Number of last ones to leave all others out for; 0 for none. A certificate then
+            checks it where the flight ends.
         tolerance: Violation of the flown trajectory that a certificate accepts, in ``unit``; a
             function of the parameters' values where it grows with the vehicle; None for a
             thousandth of the scale.
@@ -125,32 +141,41 @@ class Constraint:
     unit: str
     where: Where = Where.NODE
     skip_first: bool = False
-    skip_last: bool = False
-    tolerance: float | Callable[[Mapping[str, Any]], float] | None = None
+    skip_last: int = 0
+    tolerance: Tolerance | None = None
+    only_last: int = 0
 
     def __post_init__(self) -> None:
         checks.named("name of a constraint", self.name)
         checks.plain(f"constraint {self.name}", self, Where=Where)
         checks.positive(f"scale of constraint {self.name}", self.scale)
         checks.function(f"constraint {self.name}", self.expression)
-        if self.tolerance is not None and not callable(self.tolerance):
-            checks.not_negative(f"tolerance of constraint {self.name}", self.tolerance)
+        if self.tolerance is not None:
+            require_tolerance(f"tolerance of constraint {self.name}", self.tolerance)
+        for label in ("skip_last", "only_last"):
+            value = getattr(self, label)
+            if not (isinstance(value, int) and value >= 0):
+                what = f"{label} of constraint {self.name}"
+                raise InvalidInputError(what, value, "a whole number >= 0")
+        if self.only_last and (self.skip_first or self.skip_last):
+            what, bound = f"only_last of constraint {self.name}", "0 with skip_first or skip_last"
+            raise InvalidInputError(what, self.only_last, bound)
 
-    def accepted(self, table: ParameterTable, packed: NDArray[np.float64]) -> float:
-        """The tolerance for packed parameters; infinite only where the function says so.
+    def places(self, count: int) -> range:
+        """Indices of the nodes or intervals, of which there are this many, where it is imposed."""
+        first = max(0, count - self.only_last) if self.only_last else int(self.skip_first)
+        return range(first, count - self.skip_last)
+
+    def accepted(self, table: ParameterTable, values: KnownParameters) -> float:
+        """The tolerance for the parameters' values; infinite only where the function says so.
 
         Raises:
             InvalidInputError: The function raises, or returns no number from zero.
         """
         if self.tolerance is None:
             return ACCEPTED_VIOLATION * self.scale
-        if not callable(self.tolerance):
-            return self.tolerance
         what = f"tolerance of constraint {self.name}"
-        value = numeric(what, table, self.tolerance, packed)
-        if not (isinstance(value, float) and value == math.inf):
-            checks.not_negative(what, value)
-        return float(value)
+        return accepted_tolerance(what, self.tolerance, table, values, infinite=True)
 
 
 class PathConstraint(Constraint):
@@ -188,7 +213,8 @@ class Miss:
         name: Name in reports.
         expression: ``(x(t_f), p)`` to a nonnegative scalar, SI.
         unit: Its unit.
-        tolerance: Largest value that a certificate accepts.
+        tolerance: Largest value that a certificate accepts, or a function of the parameters' values
+            that returns it.
 
     Example:
         >>> import casadi as ca
@@ -201,13 +227,21 @@ class Miss:
     name: str
     expression: Callable[[ca.SX, Parameters], ca.SX]
     unit: str
-    tolerance: float
+    tolerance: Tolerance
 
     def __post_init__(self) -> None:
         checks.named("name of a miss", self.name)
         checks.plain(f"miss {self.name}", self)
         checks.function(f"miss {self.name}", self.expression)
-        checks.not_negative(f"tolerance of miss {self.name}", self.tolerance)
+        require_tolerance(f"tolerance of miss {self.name}", self.tolerance)
+
+    def accepted(self, table: ParameterTable, values: KnownParameters) -> float:
+        """The tolerance for the parameters' values.
+
+        Raises:
+            InvalidInputError: The function raises, or returns no finite number from zero.
+        """
+        return accepted_tolerance(f"tolerance of miss {self.name}", self.tolerance, table, values)
 
 
 def pinned_miss(index: int, state: Variable, final: Callable[[Parameters], ca.SX]) -> Miss:

@@ -181,6 +181,13 @@ class ParameterTable:
         )
 
 
+def without_infinities(value: Any) -> Any:
+    """A number, or a list of them, with None for those that are infinite."""
+    if isinstance(value, list):
+        return [without_infinities(part) for part in value]
+    return None if math.isinf(value) else value
+
+
 def load_parameter_file(path: str | Path) -> dict[str, Value]:
     """Read a vehicle or mission file: a YAML mapping of parameter names to SI values.
 

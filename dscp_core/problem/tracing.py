@@ -16,6 +16,7 @@ from dscp_core.errors import InvalidInputError
 from dscp_core.problem.parameters import ParameterTable
 
 _LONGEST_MESSAGE = 300
+_OF_VALUES = "a function of the parameters' values"
 
 
 class UnknownParameterError(KeyError):
@@ -139,10 +140,26 @@ def numeric(
     Raises:
         InvalidInputError: It raises; the message names it, and the place in its file.
     """
-    values = KnownParameters(table.unpack(packed))
-    arguments = (values,) if state is None else (state, values)
-    expected = "a function of the parameters' values"
-    return called(what, table, function, *arguments, expected=expected)
+    values = known_values(table, packed)
+    if state is None:
+        return of_values(what, table, function, values)
+    return called(what, table, function, state, values, expected=_OF_VALUES)
+
+
+def known_values(table: ParameterTable, packed: NDArray[np.float64]) -> KnownParameters:
+    """Values of packed parameters by name, for functions of a declaration that take numbers."""
+    return KnownParameters(table.unpack(packed))
+
+
+def of_values(
+    what: str, table: ParameterTable, function: Callable[..., Any], values: KnownParameters
+) -> Any:
+    """Result of a function of a declaration that takes the parameters' values alone.
+
+    Raises:
+        InvalidInputError: As `numeric`.
+    """
+    return called(what, table, function, values, expected=_OF_VALUES)
 
 
 def _refusal(

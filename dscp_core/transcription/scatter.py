@@ -92,7 +92,7 @@ class ValueScatter:
                 if block.group == constraint.name and block.kind is Kind.CONE_VECTOR
             )
             count = layout.intervals + (constraint.where is Where.NODE)
-            places = np.arange(int(constraint.skip_first), count - int(constraint.skip_last))
+            places = np.array(constraint.places(count), dtype=int)
             if isinstance(constraint, ConeConstraint):
                 soc_dims += [dimension] * places.size
             groups.append(RowGroup(constraint.name, start, dimension, places))

@@ -160,7 +160,8 @@ class Symbols:
     def mean(self, vector: ca.SX) -> StagePoint:
         """Point at the interval mean."""
         first, second = self.nodes(vector)
-        return StagePoint((first.x + second.x) / 2, (first.u + second.u) / 2, first.step)
+        x, u = (first.x + second.x) / 2, (first.u + second.u) / 2
+        return StagePoint(x, u, first.step, second.u - first.u)
 
     def node(self, vector: ca.SX) -> StagePoint:
         """Point at the first node."""

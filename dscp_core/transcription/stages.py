@@ -40,6 +40,7 @@ from dscp_core.transcription.costs import (
     terminal_cost,
 )
 from dscp_core.transcription.dynamics import defect
+from dscp_core.transcription.imposed import held
 from dscp_core.transcription.layout import TrajectoryLayout
 from dscp_core.transcription.stage import Collector, Kind, Stage, Symbols
 
@@ -171,7 +172,7 @@ def build_stages(
     """
     seen = ControlHold.MEAN if discretisation is Discretisation.MIDPOINT else hold
     terms = tuple(term for term in problem.cost_terms if term.hold in (None, seen))
-    problem = replace(problem, cost_terms=terms)
+    problem = replace(held(problem, hold), cost_terms=terms)
     pair, single = Symbols(problem, layout, 2), Symbols(problem, layout, 1)
     residual = defect(problem, pair, discretisation, hold)
     packed = ca.MX.sym("parameters", problem.table.size)

@@ -97,7 +97,7 @@ class Transcription:
         self.discretisation = discretisation
         self.hold = hold
         stages = build_stages(problem, self.layout, discretisation, hold)
-        scatter = ValueScatter(problem, self.layout, stages)
+        scatter = ValueScatter(stages.problem, self.layout, stages)
         self.pattern: ConePattern = scatter.pattern
         self.costs: CostAnalysis = stages.costs
         self._stages = stages

@@ -10,6 +10,7 @@ from dscp_core.errors import InvalidInputError
 from dscp_core.gradients.losses import LossGradient
 from dscp_core.problem.declaration import TERMINAL_TIME, named
 from dscp_core.problem.flight import ControlHold
+from dscp_core.problem.tracing import known_values
 from dscp_core.scp.scp import ScpResult
 from dscp_core.transcription.compiled import CompiledFunction
 from dscp_core.transcription.transcription import Transcription
@@ -21,8 +22,9 @@ class MissLoss:
     """Root sum of squares of the problem's misses, each in units of what a certificate accepts.
 
     The true dynamics are flown from the first node under the planned controls by the classical
-    Runge-Kutta method; a certificate flies them independently, with error control. See
-    `dscp_core.gradients.losses.Loss`.
+    Runge-Kutta method, to the plan's end, for there the miss is smooth; a certificate flies them
+    independently, with error control, and to the problem's end event. What it accepts counts as
+    constant. See `dscp_core.gradients.losses.Loss`.
     """
 
     def __init__(
@@ -65,8 +67,9 @@ class MissLoss:
             ca.repmat(step, 1, layout.intervals),
             ca.repmat(packed, 1, layout.intervals),
         )
-        miss = _miss(transcription)(flown[:, -1], packed)
-        inputs = [reference, packed]
+        accepted = ca.MX.sym("accepted", len(problem.end_checks))
+        miss = _miss(transcription)(flown[:, -1], accepted, packed)
+        inputs = [reference, accepted, packed]
         self._value = CompiledFunction("miss", inputs, [miss])
         self._gradient = CompiledFunction(
             "miss_gradient", inputs, [ca.gradient(miss, reference), ca.gradient(miss, packed)]
@@ -74,11 +77,11 @@ class MissLoss:
 
     def value(self, transcription: Transcription, trace: ScpResult) -> float:
         """See `Loss.value`."""
-        return float(self._value(trace.final_reference, trace.parameters)[0][0])
+        return float(self._value(*_arguments(transcription, trace))[0][0])
 
     def gradient(self, transcription: Transcription, trace: ScpResult) -> LossGradient:
         """See `Loss.gradient`."""
-        reference, parameters = self._gradient(trace.final_reference, trace.parameters)
+        reference, parameters = self._gradient(*_arguments(transcription, trace))
         decisions = np.zeros((len(trace.iterations), transcription.layout.size))
         decisions[-1, : reference.size] = reference
         return LossGradient(decisions, parameters)
@@ -112,10 +115,18 @@ def _interval(transcription: Transcription, hold: ControlHold, substeps: int) ->
     return ca.Function("interval", [start, ends, step, packed], [x])
 
 
+def _arguments(transcription: Transcription, trace: ScpResult) -> tuple[Array, Array, Array]:
+    table, packed = transcription.table, trace.parameters
+    values = known_values(table, packed)
+    accepted = [m.accepted(table, values) for m in transcription.problem.end_checks]
+    return trace.final_reference, np.array(accepted), packed
+
+
 def _miss(transcription: Transcription) -> ca.Function:
     problem, layout = transcription.problem, transcription.layout
     x, packed = ca.SX.sym("x", layout.nx), ca.SX.sym("p", problem.table.size)
+    accepted = ca.SX.sym("accepted", len(problem.end_checks))
     parameters = named(problem, packed)
     state = x * ca.DM(layout.state_scale)
-    relative = [m.expression(state, parameters) / m.tolerance for m in problem.end_checks]
-    return ca.Function("miss", [x, packed], [ca.norm_2(ca.vertcat(*relative))])
+    misses = ca.vertcat(*(m.expression(state, parameters) for m in problem.end_checks))
+    return ca.Function("miss", [x, accepted, packed], [ca.norm_2(misses / accepted)])

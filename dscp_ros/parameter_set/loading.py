@@ -50,7 +50,7 @@ class ParameterSet:
     values: Mapping[str, Any]
     network: Path | None
     terminal_time_network: TerminalTimeNetwork | None
-    vehicle: Mapping[str, float | list[float]]
+    vehicle: Mapping[str, Any]
     provenance: Mapping[str, Any]
 
     @property

@@ -57,7 +57,7 @@ class CheckedValues:
         return dict(self.problem.table.unpack(self.problem.pack(self.planner.parameters)))
 
     @property
-    def vehicle(self) -> dict[str, float | list[float]]:
+    def vehicle(self) -> dict[str, Any]:
         """Those of them that fix the optimum."""
         return self.problem.vehicle_of(self.parameters)
 

@@ -32,6 +32,7 @@ class NodeParameter:
         choices: Permitted texts; empty for any.
         read_only: Whether it can be set at the start only.
         may_be_empty: Whether an empty text is a value.
+        infinite: Whether numbers may be infinite: bounds, which are then none.
     """
 
     name: str
@@ -43,6 +44,7 @@ class NodeParameter:
     choices: tuple[str, ...] = ()
     read_only: bool = False
     may_be_empty: bool = False
+    infinite: bool = False
 
     def descriptor(self) -> ParameterDescriptor:
         """Descriptor with range and constraints."""
@@ -56,7 +58,7 @@ class NodeParameter:
             descriptor.integer_range = [
                 IntegerRange(from_value=int(self.lower), to_value=int(self.upper), step=0)
             ]
-        elif isinstance(self.default, float):
+        elif isinstance(self.default, float) and not self.infinite:
             largest = sys.float_info.max
             descriptor.floating_point_range = [
                 FloatingPointRange(
@@ -65,8 +67,10 @@ class NodeParameter:
                 )
             ]
         elif not isinstance(self.default, str):
+            # The range of a descriptor has no room for infinity.
+            count = 1 if isinstance(self.default, float) else len(self.default)
             descriptor.additional_constraints = (
-                f"{len(self.default)} numbers in [{self.lower:g}, {self.upper:g}]"
+                f"{count} number{'s' * (count != 1)} in [{self.lower:g}, {self.upper:g}]"
             )
         return descriptor
 
@@ -93,8 +97,8 @@ class NodeParameter:
                     self.name, components, f"{len(self.default)} numbers, each with a point"
                 )
         for component in components:
-            if not math.isfinite(component):
-                raise InvalidInputError(self.name, value, "finite")
+            if math.isnan(component) or (math.isinf(component) and not self.infinite):
+                raise InvalidInputError(self.name, value, "no NaN" if self.infinite else "finite")
             if not self.lower <= component <= self.upper:
                 bound = f"[{self.lower:g}, {self.upper:g}] {self.unit}".rstrip()
                 raise InvalidInputError(self.name, value, bound)

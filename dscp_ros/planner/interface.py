@@ -72,6 +72,7 @@ def node_parameter(declared: Parameter) -> NodeParameter:
         declared.unit,
         declared.lower,
         declared.upper,
+        infinite=declared.infinite,
     )
 
 

@@ -124,6 +124,7 @@ class Subproblem:
         b[start + 7 :] = (
             np.concatenate([values["final_position"], values["final_velocity"]]) / STATE_SCALE[:6]
         )
+        b[start + 7] += values["gate_height"] / STATE_SCALE[0]
         return a, b
 
     def _rows(self, size: int, printed: bool) -> list[tuple[Array, float]]:
@@ -162,6 +163,8 @@ class Subproblem:
                 mean = (self.controls[n] + self.controls[n + 1]) / 2
                 least_n = values["mean_thrust_fraction"] * values["thrust_min"]
                 add_norm([n, n + 1], mean, -1.0, least_n)
+        add({self.x(self.intervals).stop - 1: -1.0}, -values["dry_mass"] / MASS_KG)
+        if not printed:
             for n in nodes:
                 add({}, values["thrust_max"] / THRUST_N)
                 for k in range(3):
@@ -174,11 +177,14 @@ class Subproblem:
             for k in (1, 2):
                 add({column + k: lateral}, lateral * apex[k])
 
-        for n in nodes:
-            add_cone(values["pointing_angle_max"], self.u(n).start, np.zeros(3))
+        origin, tilt = np.zeros(3), values["contact_tilt_max"]
+        for n in range(self.intervals - 1):
+            add_cone(values["pointing_angle_max"], self.u(n).start, origin)
         target = np.asarray(values["final_position"]) / STATE_SCALE[:3]
         for n in range(1, self.intervals):
             add_cone(values["glideslope_angle_max"], self.x(n).start, target)
+        for n in (self.intervals - 1, self.intervals):
+            add_cone(min(tilt, values["pointing_angle_max"]), self.u(n).start, origin)
         return rows
 
     def _costs(self, size: int, printed: bool) -> tuple[Array, Array]:

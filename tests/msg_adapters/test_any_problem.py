@@ -227,7 +227,19 @@ def test_a_scene_that_is_none_is_refused_by_name(scene, field):
 
 def certificate(*checks: Check, used: float | None = None) -> PlanCertificate:
     none = np.zeros((1, 1))
-    return PlanCertificate(True, (), checks, np.zeros(1), none, none, ControlHold.MEAN, used)
+    return PlanCertificate(
+        passed=True,
+        reasons=(),
+        checks=checks,
+        unchecked=(),
+        times_s=np.zeros(1),
+        states=none,
+        controls=none,
+        hold=ControlHold.MEAN,
+        contact_time_s=None,
+        mass_used_kg=used,
+        propellant_left_kg=None,
+    )
 
 
 def test_values_of_a_certificate_are_those_of_the_problem():

@@ -177,11 +177,14 @@ def test_certificate_becomes_figures():
         passed=False,
         reasons=("glideslope",),
         checks=(miss, speed, glideslope),
+        unchecked=("dry_mass",),
         times_s=np.zeros(1),
         states=np.zeros((1, 7)),
         controls=np.zeros((1, 3)),
         hold=ControlHold.MEAN,
+        contact_time_s=32.0,
         mass_used_kg=6000.0,
+        propellant_left_kg=None,
     )
     figures = figures_from_certificate(certificate, ("miss_position", "miss_speed"))
     assert figures == CertificateFigures(

@@ -103,7 +103,7 @@ def solve(
     limits = []
     for c in problem.path_constraints:
         limit = ca.Function("limit", [x, u], [c.expression(at, p) / c.scale])
-        nodes = slice(int(c.skip_first), count - int(c.skip_last))
+        nodes = slice(count - 1 if c.only_last else int(c.skip_first), count - int(c.skip_last))
         limits.append(limit.map(nodes.stop - nodes.start)(at_nodes[:, nodes], acting[:, nodes]).T)
     inequalities = ca.vertcat(*limits, ca.MX(0, 1))
     unknowns = ca.vertcat(time_s, ca.vec(scaled_x), ca.vec(scaled_u))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -16,7 +15,6 @@ from dscp_core.problems.entry.physics import ALPHA, BANK, GAMMA, RADIUS, SPEED, 
 ALTITUDE_MAX_M = 150e3
 """Above, an exponential atmosphere says nothing, and nothing steers."""
 
-_ANGLE_TOLERANCE_RAD = math.radians(0.5)  # navigation noise on a vehicle at its limit
 _SPEED_LEAST_M_S = 100.0
 _GRID = 41
 
@@ -26,6 +24,7 @@ _INTERVALS = (
     ("bank_angle_min", "bank_angle_max"),
     ("angle_of_attack_rate_min", "angle_of_attack_rate_max"),
     ("bank_rate_min", "bank_rate_max"),
+    ("final_altitude_tolerance", "final_position_tolerance"),
 )
 
 
@@ -44,7 +43,7 @@ def check_state(state: NDArray[np.float64], values: Mapping[str, Any]) -> None:
         raise InvalidInputError("speed", float(state[SPEED]), f">= {_SPEED_LEAST_M_S:g} m/s")
     for name, index in (("angle_of_attack", ALPHA), ("bank_angle", BANK)):
         low, high = float(values[f"{name}_min"]), float(values[f"{name}_max"])
-        tolerance = _ANGLE_TOLERANCE_RAD
+        tolerance = float(values["angle_tolerance"])
         if not low - tolerance <= state[index] <= high + tolerance:
             raise InvalidInputError(name, float(state[index]), f"[{low:.4f}, {high:.4f}] rad")
 

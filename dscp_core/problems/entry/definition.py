@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from enum import Enum
@@ -21,6 +20,7 @@ from dscp_core.problem.declaration import (
     Variable,
     Where,
 )
+from dscp_core.problem.ending import Tolerance
 from dscp_core.problem.extras import Extras
 from dscp_core.problems.entry.aero_table import read_aerodynamic_table
 from dscp_core.problems.entry.checks import check_parameters, check_printed, check_state
@@ -134,21 +134,17 @@ _FINAL_STATE = {
 }
 
 
-# What a certificate accepts. Between nodes a limit is exceeded where the trajectory curves; the
-# angles of a measured state may be off by noise, and node 0 is pinned to it.
-_PATH_SHARE = 5e-3
-_ANGLE_TOLERANCE_RAD = math.radians(0.5)
+# What a certificate accepts of controls and speed, both of which plans keep at the nodes.
 _RATE_TOLERANCE_RAD_S = 1e-6
 _SPEED_TOLERANCE_M_S = 1.0
-# The midpoint rule's own error is 290 m, 9 m of them in altitude, and 0.6 m/s at 100 intervals. It
-# falls with their square. With controls linear between the nodes it is 1300 m, 55 m and 1.1 m/s.
-_MISS_POSITION_M = 2000.0
-_MISS_ALTITUDE_M = 100.0
-_MISS_SPEED_M_S = 10.0
+
+
+def _accepted(name: str) -> Callable[[Mapping[str, Any]], float]:
+    return lambda values: float(values[name])
 
 
 def _share_of(name: str) -> Callable[[Mapping[str, Any]], float]:
-    return lambda values: _PATH_SHARE * float(values[name])
+    return lambda values: float(values["path_tolerance"] * values[name])
 
 
 def _limit(
@@ -171,7 +167,7 @@ def _box(
     component: Callable[[StagePoint], ca.SX],
     scale: float,
     unit: str,
-    tolerance: float,
+    tolerance: Tolerance,
     *,
     skip_first: bool,
 ) -> tuple[PathConstraint, PathConstraint]:
@@ -206,10 +202,17 @@ _CONSTRAINTS = (
         lambda at: at.x[ALPHA],
         1.0,
         "rad",
-        _ANGLE_TOLERANCE_RAD,
+        _accepted("angle_tolerance"),
         skip_first=True,
     ),
-    *_box("bank_angle", lambda at: at.x[BANK], 1.0, "rad", _ANGLE_TOLERANCE_RAD, skip_first=True),
+    *_box(
+        "bank_angle",
+        lambda at: at.x[BANK],
+        1.0,
+        "rad",
+        _accepted("angle_tolerance"),
+        skip_first=True,
+    ),
     *_box(
         "angle_of_attack_rate",
         lambda at: at.u[0],
@@ -253,11 +256,25 @@ def _miss_altitude(x: ca.SX, p: Parameters) -> ca.SX:
     return ca.fabs(x[RADIUS] - p["final_radius"])
 
 
+def _risen(x: ca.SX, p: Parameters) -> ca.SX:
+    return x[GAMMA] - p["final_flight_path_angle"]
+
+
+def _turned(x: ca.SX, p: Parameters) -> ca.SX:
+    return x[HEADING] - _short_way(p["final_heading"], x[HEADING])
+
+
 def _miss_speed(x: ca.SX, p: Parameters) -> ca.SX:
     """Part of the velocity across the wanted direction, m/s; the speed itself is free."""
-    turned = x[HEADING] - _short_way(p["final_heading"], x[HEADING])
-    risen = x[GAMMA] - p["final_flight_path_angle"]
-    return x[SPEED] * ca.sqrt(risen**2 + (ca.cos(x[GAMMA]) * turned) ** 2)
+    return x[SPEED] * ca.sqrt(_risen(x, p) ** 2 + (ca.cos(x[GAMMA]) * _turned(x, p)) ** 2)
+
+
+def _miss_flight_path_angle(x: ca.SX, p: Parameters) -> ca.SX:
+    return ca.fabs(_risen(x, p))
+
+
+def _miss_heading(x: ca.SX, p: Parameters) -> ca.SX:
+    return ca.fabs(_turned(x, p))
 
 
 def _weighted(problem: OptimalControlProblem, gamma: float, rates: float) -> OptimalControlProblem:
@@ -307,10 +324,15 @@ def entry(formulation: Formulation = Formulation.QUADRATIC) -> OptimalControlPro
         check_parameters=check_parameters,
         check_state=check_state,
         terminal_time_guess=terminal_time_guess,
-        misses=(
-            Miss("miss_position", _miss_position, "m", _MISS_POSITION_M),
-            Miss("miss_altitude", _miss_altitude, "m", _MISS_ALTITUDE_M),
-            Miss("miss_speed", _miss_speed, "m/s", _MISS_SPEED_M_S),
+        misses=tuple(
+            Miss(f"miss_{name}", miss, unit, _accepted(f"final_{name}_tolerance"))
+            for name, miss, unit in (
+                ("position", _miss_position, "m"),
+                ("altitude", _miss_altitude, "m"),
+                ("speed", _miss_speed, "m/s"),
+                ("flight_path_angle", _miss_flight_path_angle, "rad"),
+                ("heading", _miss_heading, "rad"),
+            )
         ),
         control_states=(ALPHA, BANK),
         formulation=Formulation.QUADRATIC.value,

@@ -6,6 +6,7 @@ import math
 
 from dscp_core.problem.declaration import TERMINAL_TIME
 from dscp_core.problem.parameters import Parameter
+from dscp_core.problems.entry.tolerances import TOLERANCES
 
 TABLE = "Table 2 of the paper"
 TEXT = "section 4.2.1 of the paper"
@@ -393,4 +394,5 @@ PARAMETERS: tuple[Parameter, ...] = (
     *_VEHICLE,
     *_PLANET,
     *_COST,
+    *TOLERANCES,
 )

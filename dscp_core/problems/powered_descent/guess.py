@@ -9,11 +9,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dscp_core.problem.declaration import TERMINAL_TIME, InitialGuess
+from dscp_core.transcription.compiled import Symbol
 
 
 def norm(vector: ca.SX) -> ca.SX:
     """Euclidean norm with a finite derivative at zero (1 uN against 1e5 N)."""
     return ca.sqrt(ca.sumsqr(vector) + 1e-12)
+
+
+def target(p: Mapping[str, Symbol]) -> Symbol:
+    """Where a plan ends: the gate above the landing point, (3, 1)."""
+    return p["final_position"] + ca.vertcat(p["gate_height"], 0, 0)
 
 
 def _trapezoid_sums(intervals: int) -> NDArray[np.float64]:
@@ -42,7 +48,7 @@ def _least_norm_flight(p: Mapping[str, ca.MX], intervals: int) -> tuple[ca.MX, c
     coasting = ca.mtimes(p["initial_velocity"], ones) + ca.mtimes(gravity, elapsed)
     speed_gap = p["final_velocity"] - coasting[:, -1]
     travelled = step * ca.mtimes(coasting, ca.DM(sums[-1]))
-    position_gap = p["final_position"] - p["initial_position"] - travelled
+    position_gap = target(p) - p["initial_position"] - travelled
     gaps = ca.horzcat(speed_gap / step, position_gap / step**2)
     acceleration = ca.mtimes(gaps, right_inverse.T)
     velocity = coasting + step * ca.mtimes(acceleration, ca.DM(sums.T))

@@ -10,6 +10,76 @@ from dscp_core.problem.parameters import Parameter
 PAPER = "Table 1 of the paper"
 
 THRUST_PROX = "thrust_prox"
+TILT_UPPER_RAD = 1.55
+"""Near the horizontal, where a cone about the vertical ends."""
+
+
+def _accepted(
+    name: str, default: float, unit: str, what: str, upper: float, source: str = "chosen"
+) -> Parameter:
+    """Something that a certificate accepts; no optimum depends on it."""
+    return Parameter(
+        name, default, unit, what, lower=0.0, upper=upper, source=source, fixes_optimum=False
+    )
+
+
+_CERTIFICATE: tuple[Parameter, ...] = (
+    _accepted(
+        "contact_position_max",
+        1.0,
+        "m",
+        "Greatest distance from the target where a plan ends: at contact, or at the gate.",
+        1e4,
+        "what landing sites are surveyed to",
+    ),
+    _accepted(
+        "contact_speed_max",
+        0.5,
+        "m/s",
+        "Greatest difference from final_velocity there.",
+        100.0,
+    ),
+    _accepted(
+        "contact_lateral_speed_max",
+        0.5,
+        "m/s",
+        "Greatest lateral difference from final_velocity at contact.",
+        100.0,
+    ),
+    Parameter(
+        "contact_tilt_max",
+        math.radians(30.0),
+        "rad",
+        "Greatest angle between thrust and vertical in the last interval, and so at contact, where "
+        "it is less than pointing_angle_max. A vehicle file that does not give it has none.",
+        lower=1e-3,
+        upper=TILT_UPPER_RAD,
+        source="the paper's pointing limit",
+    ),
+    _accepted(
+        "altitude_floor_tolerance",
+        0.02,
+        "m",
+        "How far a flight may be below final_position before contact, such as at a start that is "
+        "measured with noise.",
+        0.5,
+    ),
+    _accepted(
+        "glideslope_tolerance",
+        1.0,
+        "m",
+        "How far a flight may be outside the glideslope's cone, as it bulges between the nodes.",
+        1e3,
+    ),
+    _accepted(
+        "thrust_tolerance",
+        1e-3,
+        "1",
+        "How far a flight may pass a limit of the thrust: as a share of thrust_max for its size, "
+        "change and distance to the pointing cone, of contact_tilt_max for its angle.",
+        0.1,
+    ),
+)
 
 PARAMETERS: tuple[Parameter, ...] = (
     Parameter(
@@ -87,6 +157,16 @@ PARAMETERS: tuple[Parameter, ...] = (
         source="inferred: reproduces the paper's optimum",
     ),
     Parameter(
+        "gate_height",
+        0.0,
+        "m",
+        "Height above final_position at which a plan ends, with final_velocity; 0: it ends in "
+        "contact with the ground there.",
+        lower=0.0,
+        upper=1e4,
+        source="chosen",
+    ),
+    Parameter(
         "thrust_min",
         169.0e3,
         "N",
@@ -96,6 +176,26 @@ PARAMETERS: tuple[Parameter, ...] = (
         source=PAPER,
     ),
     Parameter("thrust_max", 845.2e3, "N", "Greatest thrust.", lower=1.0, upper=1e9, source=PAPER),
+    Parameter(
+        "thrust_rate_max",
+        math.inf,
+        "N/s",
+        "Greatest change of the thrust vector per time; infinite: no limit. Needs controls that "
+        "are held linearly.",
+        lower=1.0,
+        source="not in the paper",
+        infinite=True,
+    ),
+    Parameter(
+        "dry_mass",
+        22200.0,
+        "kg",
+        "Mass without usable propellant, below which no plan may burn; 0: unknown, not checked. A "
+        "vehicle file that does not give it leaves it unknown.",
+        lower=0.0,
+        upper=1e7,
+        source="chosen: published for the first stage of a launcher of this size",
+    ),
     Parameter(
         "specific_impulse",
         282.0,
@@ -111,7 +211,7 @@ PARAMETERS: tuple[Parameter, ...] = (
         "rad",
         "Greatest angle between thrust and vertical (eta_max).",
         lower=1e-3,
-        upper=1.55,
+        upper=TILT_UPPER_RAD,
         source=PAPER,
     ),
     Parameter(
@@ -180,4 +280,5 @@ PARAMETERS: tuple[Parameter, ...] = (
         source="chosen",
         fixes_optimum=False,
     ),
+    *_CERTIFICATE,
 )

@@ -170,8 +170,8 @@ def test_bound_of_the_mean_thrust(fine: Scp) -> None:
     direction = unit(fine, "mean_thrust_fraction", 0)
     exact, measured = compare(same, parameters, direction, 1e-4)
     assert exact != 0.0
-    # Changes the mass by 1e-4 kg: rounding of 1e-11 kg.
-    assert exact == pytest.approx(measured, rel=1e-6)
+    # Changes the mass by 1e-4 kg: the solver leaves 1e-9 kg.
+    assert exact == pytest.approx(measured, rel=1e-5)
 
 
 @pytest.mark.parametrize("time_s", [31.0, 31.8])

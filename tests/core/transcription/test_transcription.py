@@ -39,6 +39,9 @@ class Case:
         rng = np.random.default_rng(11)
         changes: dict[str, Value] = {
             "terminal_time": 30.0,
+            "gate_height": 4.0,
+            "contact_tilt_max": 0.3,
+            "thrust_rate_max": 1e5,  # means that are held have none
             "final_position": [20.0, -30.0, 10.0],
             "final_velocity": [-1.0, 2.0, 0.5],
             "time_weight": 30.0,
@@ -115,11 +118,11 @@ def test_cones_are_declared_in_the_order_of_the_rows(case: Case) -> None:
     pattern, nodes = case.transcription.pattern, INTERVALS + 1
     times = 2 * int(case.free)
     if case.printed:
-        assert pattern.n_nonnegative == times + 2 * nodes
-        assert pattern.soc_dims == (3,) * nodes + (3,) * (nodes - 2)
+        assert pattern.n_nonnegative == times + 2 * nodes + 1
+        assert pattern.soc_dims == (3,) * (2 * nodes - 2)
     else:
-        assert pattern.n_nonnegative == times + nodes + INTERVALS
-        assert pattern.soc_dims == (4,) * nodes + (3,) * nodes + (3,) * (nodes - 2)
+        assert pattern.n_nonnegative == times + nodes + INTERVALS + 1
+        assert pattern.soc_dims == (4,) * nodes + (3,) * (2 * nodes - 2)
 
 
 def test_subproblem_is_a_valid_convex_program(case: Case) -> None:

@@ -202,6 +202,7 @@ def test_another_vehicle_on_another_planet(free: Scp) -> None:
         standard_gravity=9.80665,
         terminal_time=45.0,
         mean_thrust_fraction=1.0,
+        dry_mass=0.0,
     )
     assert result.status is ScpStatus.CONVERGED, result.message
     time_s = free.transcription.terminal_time(result.final_reference, result.parameters)
