@@ -17,6 +17,7 @@ BENCHMARKS = {
     "random_states": "how many random states of the paper's box get a certified plan, and how fast",
     "phases": "where the time of a forward run goes, and what a backward run costs beside it",
     "entry": "entry: overhead, backward against forward, growth with the number of intervals",
+    "certificates": "random landings near their bounds against an independent flight; their cost",
     "latency": "state in to trajectory out: planner, and node over ROS topics with its memory",
     "training": "terminal-time network: error against wall time, the paper's recipe and ours",
     "prediction": "terminal-time network: time of one prediction, difference to PyTorch",

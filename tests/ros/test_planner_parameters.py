@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import pytest
@@ -201,3 +202,18 @@ def test_the_shipped_file_holds_the_defaults():
     assert shipped.pop("problem") == PROBLEM_NAME
     declared = defaults()
     assert {name: declared.get(name) for name in shipped} == shipped
+
+
+def test_an_infinite_bound_is_none_where_the_problem_says_so(tmp_path):
+    table = {p.name: p for p in parameter_table(problems.get("powered_descent"))}
+    rate = table["parameters.thrust_rate_max"]
+    assert rate.default == math.inf
+    assert not rate.descriptor().floating_point_range  # has no room for it
+    path = write(tmp_path / "p.yaml", "/**: {ros__parameters: {rate: .inf}}")
+    rate.check(read_parameters(files(path), "/planner")["rate"])
+    with pytest.raises(InvalidInputError, match="got nan, expected no NaN"):
+        rate.check(math.nan)
+    with pytest.raises(InvalidInputError, match=r"got 0.5, expected \[1, inf\] N/s"):
+        rate.check(0.5)
+    with pytest.raises(InvalidInputError, match="got inf, expected finite"):
+        table["parameters.thrust_max"].check(math.inf)
