@@ -82,7 +82,7 @@ class Pilot:
         self._intervals = intervals
         self._substeps = substeps
         self._hold = hold
-        self._propagator = Propagator(problem, limits.watched)
+        self._propagator = Propagator(problem, limits.watched, (1, intervals * substeps))
 
     def fly(
         self,

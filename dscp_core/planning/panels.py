@@ -67,7 +67,14 @@ def draw_history(
     *,
     stepped: bool = False,
 ) -> None:
-    """A panel of one quantity over time: planned at the nodes, and as flown."""
+    """A panel of one quantity over time: planned at the nodes, and as flown.
+
+    What is flown after the plan, until a contact for which it waits, is no control of it.
+    """
+    end_s = plan.times_s[-1] * (1.0 + 1e-9)
+    if stepped and certificate.times_s[-1] > end_s:
+        before = int(np.searchsorted(certificate.times_s, plan.times_s[-1] * (1.0 - 1e-9)))
+        flown = np.where(np.arange(flown.size) < before, flown, flown[before - 1])
     style = "steps-post" if stepped else "default"
     axes.plot(certificate.times_s, flown, drawstyle=style, label="integrated", **FLOWN_STYLE)
     axes.plot(plan.times_s, planned, label="planned (nodes)", **PLANNED_STYLE)

@@ -131,12 +131,15 @@ class Flight:
 class Propagator:
     """Flies steps of one problem; not safe for calls from several threads at once."""
 
-    def __init__(self, problem: OptimalControlProblem, watched: Sequence[Watched]) -> None:
+    def __init__(
+        self, problem: OptimalControlProblem, watched: Sequence[Watched], counts: Sequence[int]
+    ) -> None:
         """Compile one step.
 
         Args:
             problem: The declaration.
             watched: What is evaluated along the way.
+            counts: Numbers of steps to be ready for.
         """
         self._nx, self._nu = len(problem.states), len(problem.controls)
         self._packed = problem.table.size
@@ -144,7 +147,7 @@ class Propagator:
         self._scale = np.array([s.scale for s in problem.states])
         self._step = _step_function(problem, watched, self._scale)
         self._one = CompiledFunction("one_step", *_inlined(self._step))
-        self._many: dict[int, CompiledFunction] = {}
+        self._many = {count: self._mapped(count) for count in counts}
 
     def fly(
         self, start_s: float, state: Array, steps: Steps, interval_s: float, packed: Array

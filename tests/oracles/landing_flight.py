@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
-from oracles.powered_descent_physics import DescentParameters, ThrustLaw, state_rate
+from .powered_descent_physics import DescentParameters, ThrustLaw, state_rate
 
 Array = NDArray[np.float64]
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from oracles.powered_descent_physics import DescentParameters, ThrustLaw, state_rate
+from .powered_descent_physics import DescentParameters, ThrustLaw, state_rate
 
 Array = NDArray[np.float64]
 

@@ -44,7 +44,7 @@ def descent_figure(
         plan: The plan.
         certificate: Its certificate, with the flight.
         parameters: Vehicle and mission by name, SI.
-        title: Headline; by default verdict, terminal time, mass and miss.
+        title: Headline; by default verdict, terminal time, and mass and misses as flown.
     """
     figure = new_figure((13.5, 8.0), title or _headline(plan, certificate))
     grid = figure.add_gridspec(2, 3)
@@ -80,10 +80,13 @@ def descent_figure(
 
 
 def _headline(plan: Plan, certificate: PlanCertificate) -> str:
-    missed = {c.name: c.worst_value for c in certificate.checks}.get("miss_position")
+    worst = {c.name: c.worst_value for c in certificate.checks}
     text = f"Powered descent, {verdict(certificate)}: {plan.terminal_time_s:.2f} s, "
-    text += f"{plan.states[-1, 6]:.1f} kg at touchdown"
-    return text if missed is None else f"{text}, miss {missed:.2f} m"
+    text += f"{certificate.states[-1, 6]:.1f} kg at the end"
+    if "miss_position" not in worst:  # the flight has no end
+        return text
+    ended = "" if certificate.contact_time_s is None else "contact "
+    return f"{text}, {ended}{worst['miss_position']:.2f} m and {worst['miss_speed']:.2f} m/s off"
 
 
 def _draw_descent(
