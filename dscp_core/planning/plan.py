@@ -54,6 +54,30 @@ class TerminalTime(Enum):
 
 
 @dataclass(frozen=True)
+class BestEffort:
+    """What to fly where no feasible plan was found: the plan that violates least.
+
+    Never called certified, whatever its certificate says.
+
+    Attributes:
+        plan: The trajectory; it starts from the state that was planned from.
+        certificate: Its check, which did not pass.
+        violations: What it violates and by how much, one line each, the gravest first.
+        steps: What was made least, in this order, each with what it came to.
+
+    Example:
+        >>> from dscp_core import Planner, problems
+        >>> Planner(problems.get("powered_descent")).plan().best_effort is None
+        True
+    """
+
+    plan: Plan
+    certificate: PlanCertificate
+    violations: tuple[str, ...]
+    steps: tuple[str, ...]
+
+
+@dataclass(frozen=True)
 class PlanOutcome:
     """Everything about one attempt.
 
@@ -79,6 +103,8 @@ class PlanOutcome:
         warm_started: Whether the result came from the last plan.
         solver: Backend that answered last.
         parameters: What was planned with, by name, SI: initial state and terminal time included.
+        best_effort: What to fly where nothing feasible was found; None with a certified plan, or
+            where none was made.
 
     Example:
         >>> from dscp_core import Planner, problems
@@ -110,6 +136,7 @@ class PlanOutcome:
     warm_started: bool
     solver: str
     parameters: Mapping[str, Any] = field(repr=False)
+    best_effort: BestEffort | None = None
 
     @property
     def certified(self) -> bool:
