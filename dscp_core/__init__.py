@@ -27,9 +27,10 @@ if TYPE_CHECKING:
     from dscp_core.gradients.plan_layer import PlanLayer
     from dscp_core.gradients.run import DifferentiationError
     from dscp_core.gradients.torch_layer import DscpLossLayer, DscpTrajectoryLayer
-    from dscp_core.planning.plan import PlanOutcome, PlanStatus, TerminalTime
+    from dscp_core.planning.plan import BestEffort, PlanOutcome, PlanStatus, TerminalTime
     from dscp_core.planning.planner import Planner
     from dscp_core.planning.settings import PlannerSettings
+    from dscp_core.problem.concessions import Concessions, Shortfall
     from dscp_core.problem.declaration import (
         ConeConstraint,
         CostTerm,
@@ -60,9 +61,10 @@ _HOMES = {
     "gradients.plan_layer": ("PlanLayer",),
     "gradients.run": ("DifferentiationError",),
     "gradients.torch_layer": ("DscpLossLayer", "DscpTrajectoryLayer"),
-    "planning.plan": ("PlanOutcome", "PlanStatus", "TerminalTime"),
+    "planning.plan": ("BestEffort", "PlanOutcome", "PlanStatus", "TerminalTime"),
     "planning.planner": ("Planner",),
     "planning.settings": ("PlannerSettings",),
+    "problem.concessions": ("Concessions", "Shortfall"),
     "problem.declaration": (
         "ConeConstraint",
         "CostTerm",
@@ -91,6 +93,8 @@ _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 
 __all__ = [
     "Arrows",
+    "BestEffort",
+    "Concessions",
     "ConeConstraint",
     "ControlHold",
     "ConvergenceLoss",
@@ -127,6 +131,7 @@ __all__ = [
     "Quadrature",
     "Scene",
     "ScpOptions",
+    "Shortfall",
     "Sphere",
     "StagePoint",
     "TerminalTime",

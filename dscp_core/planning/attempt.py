@@ -88,21 +88,31 @@ class Attempt:
             solver_time_s=self._solver_time,
         )
 
+    def count(self, result: ScpResult) -> None:
+        """Count the iterations and the solver's time of a run."""
+        self._iterations += len(result.iterations)
+        self._solver_time += sum(i.solve_seconds for i in result.iterations)
+        if result.failed is not None:
+            self._solver_time += result.failed.seconds
+
+    def left_s(self) -> float | None:
+        """Wall time that is left, not below zero; None without a deadline."""
+        if self._deadline_s is None:
+            return None
+        return max(self._deadline_s - (time.perf_counter() - self._started), 0.0)
+
     def run(self, start: Start) -> PlanOutcome:
         """Iterate, choose an iterate, certify it."""
         scp = start.scp
-        if self._deadline_s is not None:
-            left = self._deadline_s - (time.perf_counter() - self._started)
+        left = self.left_s()
+        if left is not None:
             scp = scp.with_options(deadline_s=max(left, 1e-6))
         try:
             result = scp.run(start.parameters, start.reference)
         except InvalidInputError as error:  # a guess that is not finite
             message = f"no first iteration: {error}"
             return self._outcome(PlanStatus.SOLVER_FAILURE, message, start.parameters, start.source)
-        self._iterations += len(result.iterations)
-        self._solver_time += sum(i.solve_seconds for i in result.iterations)
-        if result.failed is not None:
-            self._solver_time += result.failed.seconds
+        self.count(result)
         status = _STATUS.get(result.status, PlanStatus.CERTIFIED)
         message = f"{result.status.value}: {result.message}"
         last = result.failed or (result.iterations[-1].solution if result.iterations else None)
@@ -118,7 +128,12 @@ class Attempt:
         if chosen is not None:
             layout = scp.transcription.layout
             trajectory = _flyable(scp, chosen, result.parameters)
-            plan = self._plan(scp, trajectory, result.parameters)
+            plan = self.plan_of(
+                layout.states(trajectory),
+                layout.controls(trajectory),
+                scp.transcription.terminal_time(trajectory, result.parameters),
+                result.parameters,
+            )
             evaluation = scp.transcription.evaluate(trajectory, result.parameters)
             certificate = self._verifier.certify(
                 plan.times_s, plan.states, plan.controls, result.parameters
@@ -179,20 +194,21 @@ class Attempt:
             **(values | found),
         )
 
-    def _plan(self, scp: Scp, z: Array, parameters: Array) -> Plan:
-        problem, layout = self._problem, scp.transcription.layout
-        terminal_time = scp.transcription.terminal_time(z, parameters)
-        states, controls = layout.states(z), layout.controls(z)
+    def plan_of(
+        self, states: Array, controls: Array, terminal_time_s: float, parameters: Array
+    ) -> Plan:
+        """Plan of a trajectory, SI, whose nodes are equally far apart in time."""
+        problem = self._problem
         return Plan(
             problem=problem.name,
             state_names=tuple(s.name for s in problem.states),
             control_names=tuple(c.name for c in problem.controls),
             control_states=problem.control_states,
-            times_s=np.linspace(0.0, terminal_time, layout.intervals + 1),
+            times_s=np.linspace(0.0, terminal_time_s, len(states)),
             states=states,
             controls=controls,
             state_rates=self._verifier.rates(states, controls, parameters),
-            terminal_time_s=terminal_time,
+            terminal_time_s=terminal_time_s,
         )
 
 

@@ -20,6 +20,8 @@ from dscp_core.gradients.quantities import quantity
 from dscp_core.planning.attempt import Attempt, Start
 from dscp_core.planning.certificate import PlanVerifier
 from dscp_core.planning.differentiation import differentiable, plan_gradient, suited_method
+from dscp_core.planning.fallback import Fallback
+from dscp_core.planning.least_time import fastest
 from dscp_core.planning.plan import PlanOutcome, PlanStatus, TerminalTime
 from dscp_core.planning.remainder import Remainder
 from dscp_core.planning.settings import PlannerSettings, TerminalTimePredictor
@@ -111,6 +113,9 @@ class Planner:
         self._verifier.require_checkable(self.parameters)
         self._time = self.problem.table.slice(TERMINAL_TIME)
         self._time_bounds = self._bounds_of_time()
+        self._fallback: Fallback | None = None
+        if settings.best_effort:
+            self._fallback = Fallback(self._loop(free=True), self._verifier)
 
     def __reduce__(self) -> tuple[Any, ...]:
         """By what it was made of; the copy compiles its own functions."""
@@ -196,7 +201,8 @@ class Planner:
         A warm start that does not lead to a certified plan is followed by a cold one, and with a
         free terminal time by another from the problem's own guess of it, as far as the deadline
         allows. So is a prediction: all that follows it, and all for a state that the predictor
-        does not know, has a free terminal time.
+        does not know, has a free terminal time. Where nothing leads to a certified plan, a best
+        effort follows if the settings ask for it, in what is left of the deadline.
 
         Args:
             state: (nx,), SI, in the order of `state_names`; None for `initial_state`.
@@ -214,6 +220,16 @@ class Planner:
         state = np.asarray(state, dtype=np.float64)
         layout = self.transcription.layout
         left = Remainder.of(warm_start, self.problem.name, elapsed_s, state, layout)
+        outcome = self._attempted(attempt, state, packed, left)
+        if outcome.certified or self._fallback is None:
+            return outcome
+        return self._fallback.of(attempt, outcome, state, packed, left, source)
+
+    def _attempted(
+        self, attempt: Attempt, state: Array, packed: Array, left: Remainder | None
+    ) -> PlanOutcome:
+        """Outcome of the runs that the settings ask for."""
+        source = self.settings.terminal_time
         if self._predictor is not None:
             try:
                 attempt.predicted_s = self._predict(self._predictor, state)
@@ -365,23 +381,11 @@ class Planner:
         """
         if not self.problem.least_time_parameters:
             return None
-        settings = replace(
-            self.settings,
-            terminal_time=TerminalTime.FREE,
-            parameters={**self.settings.parameters, **self.problem.least_time_parameters},
-            # The fastest descent converges slowly; 1e-4 s is enough.
-            options=replace(
-                self.settings.options,
-                max_iterations=50,
-                fixed_iterations=None,
-                cost_tolerance=3e-6,
-            ),
-        )
-        fastest = Planner(self.problem, settings)
-        result = fastest.scp.run(fastest.check_state(state))
+        search = Planner(self.problem, fastest(self.settings, self.problem.least_time_parameters))
+        result = search.scp.run(search.check_state(state))
         if result.status is not ScpStatus.CONVERGED:
             return None
-        return fastest.transcription.terminal_time(result.final_reference, result.parameters)
+        return search.transcription.terminal_time(result.final_reference, result.parameters)
 
     def _with_time(self, packed: Array, seconds: float) -> Array:
         changed = packed.copy()

@@ -44,6 +44,7 @@ class PlannerSettings:
         terminal_time: Where the terminal time comes from.
         hold: How the controls are flown between the nodes.
         discretisation: Dynamics of the intervals: those that are flown, or the paper's.
+        best_effort: Whether to make the plan of least violation where no feasible one is found.
         options: How to iterate; its deadline is set for every plan.
 
     Example:
@@ -59,6 +60,7 @@ class PlannerSettings:
     hold: ControlHold = ControlHold.MEAN
     discretisation: Discretisation = Discretisation.PROPAGATED
     options: ScpOptions = field(default_factory=ScpOptions)
+    best_effort: bool = False
 
     def __post_init__(self) -> None:
         for name, kind in (

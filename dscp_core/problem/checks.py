@@ -69,6 +69,17 @@ def distinct(field: str, names: Iterable[str], reserved: Sequence[str] = ()) -> 
         seen.add(name)
 
 
+def among(field: str, names: Iterable[Any], known: Sequence[str], bound: str) -> None:
+    """Refuse names that are not known.
+
+    Raises:
+        InvalidInputError: With all such names, and what is right.
+    """
+    unknown = sorted(set(names) - set(known), key=str)
+    if unknown:
+        raise InvalidInputError(field, unknown, bound)
+
+
 def mapping(field: str, value: Any) -> None:
     """Refuse what is no mapping.
 

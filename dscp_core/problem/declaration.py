@@ -21,6 +21,7 @@ from dscp_core.problem.algorithm import (
     VIRTUAL_CONTROL_WEIGHT,
     algorithm_parameters,
 )
+from dscp_core.problem.concessions import Concessions
 from dscp_core.problem.elements import (
     ConeConstraint,
     Constraint,
@@ -37,9 +38,9 @@ from dscp_core.problem.elements import (
 )
 from dscp_core.problem.ending import EndEvent, EventLimit, Propellant
 from dscp_core.problem.extras import Extras
-from dscp_core.problem.parameters import Parameter, ParameterTable, Value, without_infinities
+from dscp_core.problem.parameters import Parameter, ParameterTable, Value
 from dscp_core.problem.tracing import KnownParameters, numeric
-from dscp_core.problem.vehicles import Reader, vehicle_values
+from dscp_core.problem.vehicles import Reader, as_vehicle, vehicle_values
 
 Symbol = TypeVar("Symbol", ca.SX, ca.MX)
 
@@ -82,6 +83,7 @@ class OptimalControlProblem:
         parameters: Every parameter of the problem, ``terminal_time`` among them.
         dynamics: ``f(x, u, p)``, (nx, 1), SI (eq. 1).
         initial_state: Value of every state at the start, (nx, 1).
+        free_initial_states: States whose value at the start is decided instead.
         final_state: Pinned states at the end by name.
         cost_unit: Unit of the cost; "1" for a pure number.
         cost_scale: Cost of one scaled unit.
@@ -132,6 +134,7 @@ class OptimalControlProblem:
         propellant: What a flight burns.
         control_states: Index of the state that each control acts on (for named-vector messages).
         formulation: Which of several forms of the problem this is; empty where there is one.
+        concessions: What gives way, in which order, where nothing is feasible; None: nothing.
         extras: What it brings along, such as a figure of its own.
 
     Example:
@@ -167,6 +170,7 @@ class OptimalControlProblem:
     final_state: Mapping[str, Callable[[Parameters], ca.SX]]
     cost_scale: float
     initial_guess: Callable[[Mapping[str, ca.MX], int], InitialGuess]
+    free_initial_states: tuple[str, ...] = ()
     default_intervals: int = 50
     free_terminal_time: bool = False
     terminal_time_bounds: Callable[[Parameters], tuple[ca.SX, ca.SX]] | None = None
@@ -199,20 +203,20 @@ class OptimalControlProblem:
     propellant: Propellant | None = None
     control_states: tuple[int, ...] = ()
     formulation: str = ""
+    concessions: Concessions | None = None
     extras: Extras = field(default_factory=Extras)
     table: ParameterTable = field(init=False)
 
     def __post_init__(self) -> None:
         checks.plain("", self, Quadrature=Quadrature, Extras=Extras)
-        for label, one in (("end_event", EndEvent), ("propellant", Propellant)):
+        for label, one in _PARTS.items():
             checks.optional(label, getattr(self, label), one)
         checks.named("name", self.name)
         for label, kind in _MEMBERS.items():
             object.__setattr__(self, label, checks.members(label, getattr(self, label), kind))
         nx, nu = len(self.states), len(self.controls)
         if not nx or not nu:
-            missing = "controls" if nx else "states"
-            raise InvalidInputError(missing, (), "at least one Variable")
+            raise InvalidInputError("controls" if nx else "states", (), "at least one Variable")
         for label, size in (
             ("virtual_control_scale", nx),
             ("trust_region_state", nx),
@@ -245,16 +249,16 @@ class OptimalControlProblem:
 
     def _check_names(self) -> None:
         limits = [c.name for c in (*self.path_constraints, *self.cone_constraints)]
-        checks.distinct("states and controls", (v.name for v in (*self.states, *self.controls)))
+        states = [s.name for s in self.states]
+        checks.distinct("states and controls", [*states, *(c.name for c in self.controls)])
         ends = [m.name for m in self.end_checks]
         if self.end_event is not None:
             ends += [self.end_event.floor, *(limit.name for limit in self.end_event.limits)]
         checks.distinct("constraints and misses", [*limits, *ends])
         checks.distinct("constraints", limits, reserved=(TERMINAL_TIME,))
         checks.distinct("cost_terms", (t.name for t in self.cost_terms), reserved=DERIVED_COSTS)
-        unknown = sorted(set(self.final_state) - {s.name for s in self.states}, key=str)
-        if unknown:
-            raise InvalidInputError("final_state", unknown, "names of states")
+        checks.among("final_state", self.final_state, states, "names of states")
+        checks.among("free_initial_states", self.free_initial_states, states, "names of states")
         known = range(len(self.states))
         acted_on = [i for i in self.control_states if not (isinstance(i, int) and i in known)]
         if acted_on:
@@ -283,9 +287,8 @@ class OptimalControlProblem:
         size = sum(self.table[name].size for name in self.initial_state_parameters)
         if self.initial_state_parameters and size != len(self.states):
             bound = f"{len(self.states)} components, one per state, not {size}"
-            raise InvalidInputError(
-                "initial_state_parameters", self.initial_state_parameters, bound
-            )
+            given = self.initial_state_parameters
+            raise InvalidInputError("initial_state_parameters", given, bound)
         for name, value in (*self.least_time_parameters.items(), *self.file_defaults.items()):
             self.table[name].validate(value)
         if self.propellant is not None:
@@ -302,8 +305,7 @@ class OptimalControlProblem:
         """Packed parameters, SI: the defaults overridden by ``values``.
 
         Raises:
-            InvalidInputError: An unknown name, an invalid value, or values that contradict each
-                other.
+            InvalidInputError: An unknown name, an invalid value, or values that contradict.
         """
         packed = self.table.pack(values)
         self.require_consistent(packed)
@@ -358,11 +360,7 @@ class OptimalControlProblem:
             values: Every parameter by name, SI.
         """
         others = {TERMINAL_TIME, *self.initial_state_parameters}
-        return {
-            p.name: without_infinities(np.asarray(values[p.name], dtype=np.float64).tolist())
-            for p in self.table.parameters
-            if p.fixes_optimum and p.name not in others
-        }
+        return as_vehicle(self.table, others, values)
 
 
 _MEMBERS: Mapping[str, type] = {
@@ -374,7 +372,9 @@ _MEMBERS: Mapping[str, type] = {
     "cone_constraints": ConeConstraint,
     "misses": Miss,
     "initial_state_parameters": str,
+    "free_initial_states": str,
 }
+_PARTS = {"end_event": EndEvent, "propellant": Propellant, "concessions": Concessions}
 _POSITIVE = ("cost_scale", "cost_tolerance", "defect_tolerance", "virtual_control_tolerance")
 _FUNCTIONS = ("dynamics", "initial_state", "initial_guess")
 _OPTIONAL_FUNCTIONS = (

@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from dscp_core.errors import InvalidInputError
-from dscp_core.problem.parameters import Value, load_parameter_file
+from dscp_core.problem.parameters import (
+    ParameterTable,
+    Value,
+    load_parameter_file,
+    without_infinities,
+)
 
 Reader = Callable[[Path], Mapping[str, Value]]
 
@@ -38,3 +45,20 @@ def vehicle_values(
             raise InvalidInputError(name, table, f"no {', '.join(twice)} beside it")
         values.update(found)
     return {**silent, **values}
+
+
+def as_vehicle(
+    table: ParameterTable, others: Collection[str], values: Mapping[str, Any]
+) -> dict[str, Any]:
+    """The parameters that fix the optimum from a state, as JSON holds them.
+
+    Args:
+        table: Parameters of the problem.
+        others: Those that belong to the state or the plan.
+        values: Every parameter by name, SI.
+    """
+    return {
+        p.name: without_infinities(np.asarray(values[p.name], dtype=np.float64).tolist())
+        for p in table.parameters
+        if p.fixes_optimum and p.name not in others
+    }

@@ -19,7 +19,7 @@ from dscp_core.problem.declaration import (
 )
 from dscp_core.transcription.layout import TrajectoryLayout
 from dscp_core.transcription.stage import Block, Kind, Stage
-from dscp_core.transcription.stages import StageFunctions
+from dscp_core.transcription.stages import StageFunctions, pinned_at_start
 
 Indices = NDArray[np.int64]
 
@@ -105,7 +105,9 @@ class ValueScatter:
             next(i for i, s in enumerate(self._problem.states) if s.name == name)
             for name in self._problem.final_state
         ]
-        self._n_equalities = layout.intervals * layout.nx + layout.nx + len(self._final)
+        self._initial = pinned_at_start(self._problem)
+        pinned = len(self._initial) + len(self._final)
+        self._n_equalities = layout.intervals * layout.nx + pinned
 
     def _add(
         self,
@@ -177,7 +179,7 @@ class ValueScatter:
 
     def _add_boundary(self, source: int, width: int) -> None:
         layout = self._layout
-        nx, row = layout.nx, layout.intervals * layout.nx
+        row = layout.intervals * layout.nx
         one = np.array([self._one])
         for block in self._stages.boundary.blocks:
             entries = source + np.arange(block.rows.size)
@@ -187,7 +189,7 @@ class ValueScatter:
                 self._add(Kind.COST_MATRIX, columns, columns, entries)
                 continue
             if block.group == "initial_state":
-                states, node = np.arange(nx), 0
+                states, node = np.array(self._initial, int), 0
             else:
                 states, node = np.array(self._final, int), layout.intervals
             rows = row + np.arange(states.size)

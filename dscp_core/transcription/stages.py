@@ -285,6 +285,12 @@ def terminal_time_bounds(
     return ca.SX(least), ca.SX(own.upper)
 
 
+def pinned_at_start(problem: OptimalControlProblem) -> list[int]:
+    """Indices of the states whose value at the start is given, in order."""
+    free = problem.free_initial_states
+    return [index for index, state in enumerate(problem.states) if state.name not in free]
+
+
 def _boundary_stage(
     problem: OptimalControlProblem, layout: TrajectoryLayout, symbols: Symbols
 ) -> Stage:
@@ -293,7 +299,8 @@ def _boundary_stage(
     p, trace = symbols.parameters, symbols.trace
     initial = trace("initial_state", problem.initial_state, p, rows=layout.nx)
     scaled = initial / ca.DM(layout.state_scale)
-    collect.vector(Kind.EQUALITY_VECTOR, "initial_state", scaled)
+    pinned = scaled[pinned_at_start(problem)]
+    collect.vector(Kind.EQUALITY_VECTOR, "initial_state", pinned)
     scales = {s.name: s.scale for s in problem.states}
     final = [
         trace(f"final_state {name}", value, p) / scales[name]

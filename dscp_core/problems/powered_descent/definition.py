@@ -25,6 +25,7 @@ from dscp_core.problem.declaration import (
 from dscp_core.problem.extras import Extras
 from dscp_core.problem.flight import ControlHold
 from dscp_core.problems.loading import ProblemFamily
+from dscp_core.problems.powered_descent.best_effort import CONCESSIONS
 from dscp_core.problems.powered_descent.checks import (
     check_parameters,
     check_state,
@@ -167,6 +168,7 @@ def powered_descent(formulation: Formulation = Formulation.CONVERGENT) -> Optima
         file_defaults={"dry_mass": 0.0, "contact_tilt_max": TILT_UPPER_RAD},
         control_states=(3, 4, 5),
         formulation=Formulation.CONVERGENT.value,
+        concessions=CONCESSIONS,
         extras=Extras(
             figure=descent_figure, network=NETWORK, messages=MESSAGES, scene=scene_of_settings
         ),
@@ -179,6 +181,7 @@ def powered_descent(formulation: Formulation = Formulation.CONVERGENT) -> Optima
         parameters=tuple(p for p in PARAMETERS if p.name != THRUST_PROX),
         initial_guess=raw_guess,
         cost_terms=(),
+        concessions=None,
         path_constraints=(THRUST_FLOOR, LINEARISED_THRUST_CEILING, DRY_MASS),
         cone_constraints=CONES,
         virtual_control_scale=tuple(s.scale for s in STATES),
