@@ -139,8 +139,16 @@ class Fallback:
         widened: Mapping[str, float],
         source: TerminalTime,
     ) -> tuple[str, ...]:
-        """What the plan violates and by how much, one line each."""
-        lines = list(certificate.reasons)
+        """What the plan violates and by how much, one line each, the gravest first."""
+        lines = [
+            f"{shortfall.name} {error:.4g} {shortfall.unit}"
+            for shortfall, error in zip(
+                self._relaxation.concessions.shortfalls, reached.errors, strict=True
+            )
+            # What the bound of later steps allows is no shortfall.
+            if error > 2.0 * shortfall.tolerance
+        ]
+        lines += certificate.reasons
         values = self._problem.table.unpack(packed)
         if source is TerminalTime.FIXED:
             lines.append(

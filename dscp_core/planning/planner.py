@@ -354,7 +354,7 @@ class Planner:
         return PlanLayer(scp, inputs, loss, self.parameters, suited_method(loss, method))
 
     def figure(self, outcome: PlanOutcome, title: str | None = None) -> Figure:
-        """The plan of an outcome as it was made, and as it went when it was flown.
+        """The plan of an outcome, or its best effort, as made and as it went when it was flown.
 
         Args:
             outcome: With a plan.
@@ -365,10 +365,16 @@ class Planner:
         """
         from dscp_core.planning.histories import plan_figure
 
+        effort, name = outcome.best_effort, self.problem.name.replace("_", " ")
+        if effort is not None:
+            title = title or f"{name}: best effort, NOT CERTIFIED: {effort.violations[0]}"
+            return plan_figure(
+                self.problem, effort.plan, effort.certificate, outcome.parameters, title
+            )
         if outcome.plan is None or outcome.certificate is None:
             raise InvalidInputError("outcome", outcome.headline, "one with a plan")
         if title is None and not outcome.converged:
-            title = f"{self.problem.name.replace('_', ' ')}: {outcome.headline}"
+            title = f"{name}: {outcome.headline}"
         return plan_figure(
             self.problem, outcome.plan, outcome.certificate, outcome.parameters, title
         )

@@ -119,12 +119,15 @@ def parse_assignments(assignments: Sequence[str]) -> dict[str, Value]:
     return values
 
 
-def case_planner(args: argparse.Namespace, options: ScpOptions) -> Planner:
+def case_planner(
+    args: argparse.Namespace, options: ScpOptions, *, best_effort: bool = False
+) -> Planner:
     """Planner of the case.
 
     Args:
         args: Parsed arguments.
         options: How to iterate; the solver comes from the arguments.
+        best_effort: Whether to make the plan of least violation where no feasible one is found.
 
     Raises:
         InvalidInputError: A value that cannot be used.
@@ -148,6 +151,7 @@ def case_planner(args: argparse.Namespace, options: ScpOptions) -> Planner:
         intervals=intervals,
         terminal_time=TerminalTime.FREE if free else TerminalTime.FIXED,
         hold=args.hold,
+        best_effort=best_effort,
         discretisation=args.discretisation,
         options=options,
     )

@@ -18,6 +18,7 @@ from dscp_ros.cli.arguments import (
     print_parameters,
     print_table,
 )
+from dscp_ros.cli.best_effort import describe_effort, print_effort
 from dscp_ros.cli.output_files import (
     check_output_path,
     complete_file,
@@ -49,6 +50,7 @@ examples:
   dscp plan powered_descent --free-terminal-time --solver qoco,clarabel
   dscp plan powered_descent --plot plan.png --output plan.csv
   dscp plan powered_descent --set terminal_time=32 --json    (infeasible: exit code 3)
+  dscp plan powered_descent --set initial_velocity=-400,30,-30 --best-effort --plot least.png
   dscp plan entry --set surface_to_mass_ratio=0.93 --plot entry.png
   dscp plan entry --formulation printed --intervals 200
   dscp plan my_problem.py:QUADROTOR --plot quadrotor.png
@@ -60,7 +62,9 @@ deadline, solver_failure), message, certified, converged, terminal_time_s, itera
 cost_unit, subproblem_costs (what the iterations minimise of the running and the terminal cost),
 final_STATE_UNIT for every state (such as final_mass_kg), certificate (with MISS_UNIT for
 every miss, such as miss_position_m), solve_time_ms, solver, virtual_control, max_defect,
-least_feasible_terminal_time_s. null stands for what does not exist.
+least_feasible_terminal_time_s, best_effort (with --best-effort and no certified plan: violations,
+steps, terminal_time_s, final_STATE_UNIT, certificate; --plot and --output then draw and write it).
+null stands for what does not exist.
 
 exit codes: 0 certified plan, 2 bad input, 3 no such plan.
 """
@@ -77,6 +81,11 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     add_case_arguments(parser)
     parser.add_argument(
         "--deadline", type=float, metavar="S", help="wall time for the iterations, in seconds"
+    )
+    parser.add_argument(
+        "--best-effort",
+        action="store_true",
+        help="where no feasible plan is found, make the one that violates least; NOT CERTIFIED",
     )
     group = parser.add_argument_group("output")
     group.add_argument(
@@ -104,7 +113,7 @@ def run(args: argparse.Namespace) -> int:
     from dscp_core.planning.planner import TerminalTime
     from dscp_core.scp.scp import ScpOptions
 
-    planner = case_planner(args, ScpOptions())
+    planner = case_planner(args, ScpOptions(), best_effort=args.best_effort)
     planner.check_state(planner.initial_state)
     outcome = planner.plan(deadline_s=args.deadline)
     least = None
@@ -118,6 +127,8 @@ def run(args: argparse.Namespace) -> int:
         print_json({**described, **written})
     else:
         _print(described, planner, outcome)
+        if described["best_effort"] is not None:
+            print_effort(described["best_effort"])
     return ExitCode.OK if outcome.status is PlanStatus.CERTIFIED else ExitCode.NO_PLAN
 
 
@@ -163,6 +174,7 @@ def describe(planner: Planner, outcome: PlanOutcome, least_s: float | None) -> d
         "certificate": None
         if outcome.certificate is None
         else _certificate(problem, outcome.certificate),
+        "best_effort": describe_effort(problem, outcome.best_effort, _certificate),
         "parameters": outcome.parameters,
     }
 
@@ -245,8 +257,9 @@ def _write(
 ) -> dict[str, str | None]:
     """Writes the files that were asked for; returns where they are, None for those left out."""
     asked = {name: getattr(args, name) for name in ("output", "plot") if getattr(args, name)}
-    plan = _flyable(outcome)
-    if plan is None or outcome.certificate is None:
+    effort = outcome.best_effort
+    plan = _flyable(outcome) if effort is None else effort.plan
+    if plan is None or (outcome.certificate is None and effort is None):
         for name, path in asked.items():
             print(f"dscp plan: --{name}: no trajectory, {path} is not written", file=sys.stderr)
         return dict.fromkeys(asked)

@@ -118,14 +118,17 @@ def test_best_effort_says_what_it_violates(name: str) -> None:
     outcome = planner_of(CASES[name]).plan()
     effort = effort_of(outcome)
     assert not effort.certificate.passed
-    assert effort.violations[: len(effort.certificate.reasons)] == effort.certificate.reasons
+    assert set(effort.certificate.reasons) <= set(effort.violations)
+    speed, position = errors_of(effort, outcome.parameters)
+    found = {"final_speed_error": (speed, "m/s"), "final_position_error": (position, "m")}
+    expected = [f"{n} {value:.4g} {unit}" for n, (value, unit) in found.items() if value > 0.03]
+    assert list(effort.violations[: len(expected)]) == expected
     assert all(any(letter.isdigit() for letter in line) for line in effort.violations)
     assert [step.split()[0] for step in effort.steps] == [
         "final_speed_error",
         "final_position_error",
         "cost",
     ]
-    speed, _ = errors_of(effort, outcome.parameters)
     assert effort.steps[0].startswith(f"final_speed_error {speed:.4g} m/s")
     if "outside" in name:
         assert effort.violations[-1].startswith("glideslope_angle_max 1.396 rad was widened to ")
@@ -255,6 +258,18 @@ def test_degenerate_cases_end_in_words(changes: dict[str, Any]) -> None:
         return
     assert np.all(np.isfinite(outcome.best_effort.plan.states))
     assert outcome.best_effort.violations
+
+
+def test_figure_draws_the_best_effort_and_says_what_it_is() -> None:
+    planner = planner_of(CASES["too low"])
+    outcome = planner.plan()
+    figure = planner.figure(outcome)
+    title = " ".join(text.get_text() for text in figure.texts)
+    assert "best effort, NOT CERTIFIED: final_speed_error 8" in " ".join(title.split())
+    drawn = [line.get_xdata()[-1] for axes in figure.axes for line in axes.lines]
+    assert any(
+        end == pytest.approx(effort_of(outcome).plan.terminal_time_s, abs=1e-6) for end in drawn
+    )
 
 
 def test_no_state_no_best_effort() -> None:
