@@ -29,10 +29,14 @@ from std_msgs.msg import String
 
 from dscp_core import problems
 from dscp_core.planning.plan import PlanStatus
-from dscp_core.planning.planner import PlannerSettings, TerminalTime
+from dscp_core.planning.planner import Planner, TerminalTime
 from dscp_core.problems.powered_descent.messages import LANDING_FRAME, message_from_core
 from dscp_core.problems.powered_descent.scene import quaternion_from_z_axis
-from dscp_core.problems.powered_descent.simulation import DescentRecord, Replan, simulate_descent
+from dscp_core.problems.powered_descent.simulation import (
+    DescentRecord,
+    DescentSimulation,
+    Replan,
+)
 from dscp_ros.bag import BagWriter
 from msg_adapters.errors import InputCode
 from msg_adapters.frames import Array
@@ -83,13 +87,15 @@ IGNITIONS_PERIOD_S = 0.2
 
 def write_nominal(folder: Path) -> Path:
     """Writes one closed-loop descent; returns the bag."""
-    record = simulate_descent(PlannerSettings(terminal_time=TerminalTime.FREE), seed=NOMINAL_SEED)
+    planner = Planner(problems.get("powered_descent"), terminal_time=TerminalTime.FREE)
+    simulation = DescentSimulation(planner)
+    record = simulation.record(NOMINAL_SEED)
     bag = folder / NOMINAL
     with BagWriter(bag, overwrite=True) as writer:
         writer.add_topic(STORY_TOPIC, String, RELIABLE)
         writer.add_topic(MASS_TOPIC, InertiaStamped, RELIABLE)
         writer.add_topic(STATE_TOPIC, Odometry, RELIABLE)
-        for entry in sorted(_nominal_entries(record), key=lambda entry: entry.time_ns):
+        for entry in sorted(_nominal_entries(record, simulation.truth.delay_s), key=_time):
             writer.write(entry.topic, entry.message, entry.time_ns)
     return bag
 
@@ -100,13 +106,20 @@ class _Entry(NamedTuple):
     message: String | InertiaStamped | Odometry
 
 
-def _nominal_entries(record: DescentRecord) -> Iterable[_Entry]:
-    """Everything in the bag, in no order."""
+def _time(entry: _Entry) -> int:
+    return entry.time_ns
+
+
+def _nominal_entries(record: DescentRecord, delay_s: float) -> Iterable[_Entry]:
+    """Everything in the bag, in no order; measurements are stamped when they were true."""
 
     def at(time_s: float) -> int:
         return NOMINAL_START_NS + nanoseconds_from_seconds(time_s)
 
-    opening = f"closed-loop powered descent, simulation seed {record.seed}; engine on at 0 s"
+    lit = np.linalg.norm(record.commanded, axis=1) > 0.0
+    on_s = record.times_s[np.argmax(lit)]
+    seed = record.summary.seed
+    opening = f"closed-loop powered descent, simulation seed {seed}; engine on at {on_s:g} s"
     yield _Entry(at(-LEAD_S), STORY_TOPIC, String(data=opening))
     for replan in record.replans:
         time_s = record.times_s[replan.tick]
@@ -116,10 +129,10 @@ def _nominal_entries(record: DescentRecord) -> Iterable[_Entry]:
     before_ns = at(-EARLY_MASS_S)
     mass = inertia_from_mass(StampedMass(before_ns, float(record.measured[0, 6])))
     yield _Entry(before_ns, MASS_TOPIC, mass)
-    for time_s, measured, thrust in zip(
-        record.times_s, record.measured, record.commanded, strict=True
-    ):
-        stamp_ns = at(time_s)
+    # Until the engine is lit, the vehicle points where it will burn.
+    commanded = np.where(lit[:, np.newaxis], record.commanded, record.commanded[np.argmax(lit)])
+    for time_s, measured, thrust in zip(record.times_s, record.measured, commanded, strict=True):
+        stamp_ns = at(time_s - delay_s)
         mass = inertia_from_mass(StampedMass(stamp_ns, float(measured[6])))
         yield _Entry(at(time_s + MASS_LATENCY_S), MASS_TOPIC, mass)
         kinematics = Kinematics(
@@ -140,6 +153,8 @@ def _attitude(thrust: Array) -> Array:
 
 def _replan_text(time_s: float, replan: Replan) -> str:
     outcome = replan.outcome
+    if outcome is None:
+        return f"{time_s:.1f} s: onboard guidance got no answer from its planner"
     return (
         f"{time_s:.1f} s: onboard guidance {outcome.status.name}, "
         f"{outcome.terminal_time_used_s:.2f} s to go, "
@@ -148,11 +163,7 @@ def _replan_text(time_s: float, replan: Replan) -> str:
 
 
 def _end_text(record: DescentRecord) -> str:
-    end = "touchdown" if record.touched_down else "end of the last plan"
-    return (
-        f"{record.times_s[-1]:.2f} s: {end}, {record.miss_position_m:.2f} m and "
-        f"{record.miss_speed_m_s:.2f} m/s off the target, {record.states[-1, 6]:.0f} kg left"
-    )
+    return f"{record.summary.story}, {record.states[-1, 6]:.0f} kg left"
 
 
 def _set_frame(frame: str) -> Callable[[JointState], None]:

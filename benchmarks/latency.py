@@ -15,7 +15,7 @@ from dscp_core.planning.certificate import PlanVerifier
 from dscp_core.planning.plan import PlanStatus
 from dscp_core.planning.planner import Planner, PlannerSettings, TerminalTime
 from dscp_core.problem.trajectory import Plan
-from dscp_core.problems.powered_descent.simulation import DescentRecord, simulate_descent
+from dscp_core.problems.powered_descent.simulation import DescentRecord, DescentSimulation
 from dscp_core.scp.scp import ScpOptions
 
 SOLVERS = ("clarabel", "qoco,clarabel")
@@ -40,10 +40,9 @@ class Sample:
 def measure(*, quick: bool) -> Report:
     """Cold plans of random states, warm plans along flights, then the node."""
     report = Report("latency")
-    flights = [
-        simulate_descent(PlannerSettings(terminal_time=TerminalTime.FREE), seed=seed)
-        for seed in range(1 if quick else 8)
-    ]
+    free = PlannerSettings(terminal_time=TerminalTime.FREE)
+    simulation = DescentSimulation(Planner(problems.get("powered_descent"), free))
+    flights = [simulation.record(seed) for seed in range(1 if quick else 8)]
     every = 5 if quick else 2  # ticks of 0.1 s
     rows: list[tuple[Cell, ...]] = []
     for solver in SOLVERS:

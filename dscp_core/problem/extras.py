@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 from dscp_core.problem import checks
 from dscp_core.problem.messages import Messages
 from dscp_core.problem.scene import SceneOf
+from dscp_core.problem.simulation import Simulated
 from dscp_core.problem.trajectory import Plan
 
 if TYPE_CHECKING:
@@ -51,6 +52,7 @@ class Extras:
         network: File of the terminal-time network of the default vehicle.
         messages: How states and plans are told of in messages.
         scene: Its plans in space; None for none.
+        simulation: Its closed-loop flights; None for none.
 
     Example:
         >>> from dscp_core import problems
@@ -65,9 +67,10 @@ class Extras:
     network: Path | None = None
     messages: Messages = field(default_factory=Messages)
     scene: SceneOf | None = None
+    simulation: Simulated | None = None
 
     def __post_init__(self) -> None:
-        for name in ("figure", "scene"):
+        for name in ("figure", "scene", "simulation"):
             if getattr(self, name) is not None:
                 checks.function(f"{name} of extras", getattr(self, name))
         checks.plain("extras", self, Messages=Messages)

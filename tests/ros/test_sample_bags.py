@@ -75,10 +75,11 @@ def test_the_bag_is_small_and_its_topics_are_those_of_the_readme(bag: str) -> No
 
 def test_the_readme_tells_where_the_nominal_descent_ended() -> None:
     *_, end = (message.data for topic, _, message in decoded(FOLDER / NOMINAL) if topic == "/story")
-    numbers_at_end = re.search(r"(\S+ m and \S+ m/s) off the target, (\d+ kg left)", end)
-    assert numbers_at_end is not None, end
-    miss, mass = numbers_at_end.groups()
-    assert f"{miss} from the target, {mass}" in section(NOMINAL)
+    contact = re.search(
+        r"(at \S+ m/s, \S+ m from the pad, tilted by \S+ deg); .*, (\d+ kg left)", end
+    )
+    assert contact is not None, end
+    assert ", ".join(contact.groups()) in section(NOMINAL)
 
 
 @pytest.mark.parametrize("bag", BAGS)

@@ -123,7 +123,7 @@ def test_dispersed_bag_as_its_readme_says() -> None:
 
 def test_odometry_is_completed_by_mass() -> None:
     log = read(BAGS / "powered_descent_nominal")
-    assert len(log.states) == 334
+    assert len(log.states) == 348
     assert not log.refused
     masses = [state.values[6] for state in log.states]
     assert 37_000 < masses[0] < 39_000

@@ -47,6 +47,7 @@ from dscp_core.problems.powered_descent.messages import MESSAGES
 from dscp_core.problems.powered_descent.parameters import PARAMETERS, THRUST_PROX, TILT_UPPER_RAD
 from dscp_core.problems.powered_descent.scales import LENGTH_M, MASS_KG, SPEED_M_S, THRUST_N
 from dscp_core.problems.powered_descent.scene import scene_of_settings
+from dscp_core.problems.powered_descent.simulation import DescentSimulations
 
 NAME = "powered_descent"
 
@@ -170,7 +171,11 @@ def powered_descent(formulation: Formulation = Formulation.CONVERGENT) -> Optima
         formulation=Formulation.CONVERGENT.value,
         concessions=CONCESSIONS,
         extras=Extras(
-            figure=descent_figure, network=NETWORK, messages=MESSAGES, scene=scene_of_settings
+            figure=descent_figure,
+            network=NETWORK,
+            messages=MESSAGES,
+            scene=scene_of_settings,
+            simulation=DescentSimulations(),
         ),
     )
     if formulation is Formulation.CONVERGENT:

@@ -1,356 +1,258 @@
-"""Closed-loop simulation of a powered descent: a dispersed vehicle under replanned guidance.
+"""Closed-loop landings: a vehicle that is not quite as assumed, under guidance with replanning.
 
-Guidance plans from noisy measurements, the vehicle flies the plan with errors that guidance does
-not know. Planning takes no simulated time, and attitude follows the commanded thrust at once.
+Guidance sees noisy, late measurements, its plans and commands come late, engine and attitude lag.
+A flight ends where the vehicle meets the ground.
 """
 
 from __future__ import annotations
 
+import copy
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
 
-import casadi as ca
 import numpy as np
-import scipy.integrate
-from numpy.typing import NDArray
 
-from dscp_core.errors import DscpError, InvalidInputError
-from dscp_core.planning.plan import PlanOutcome, PlanStatus
-from dscp_core.planning.planner import Planner, PlannerSettings
-from dscp_core.problem.declaration import named
-from dscp_core.problem.trajectory import Plan
-from dscp_core.problems.powered_descent.definition import powered_descent
-from dscp_core.transcription.compiled import CompiledFunction
+from dscp_core.errors import DscpError
+from dscp_core.planning.planner import Planner
+from dscp_core.problem.options import declared, option, validate, values
+from dscp_core.problem.parameters import Parameter, ParameterTable
+from dscp_core.problem.simulation import FlightFigure, FlightRecord, FlightSummary, worst_of
+from dscp_core.problems.powered_descent.flight import Flight, Replan
+from dscp_core.problems.powered_descent.guidance.landing import Phase
+from dscp_core.problems.powered_descent.guidance.settings import GuidanceSettings
+from dscp_core.problems.powered_descent.guidance.vehicle import Vehicle
+from dscp_core.problems.powered_descent.truth import Array, TrueMotion, TruthSettings, VehicleErrors
 
-Array = NDArray[np.float64]
+__all__ = ["DescentRecord", "DescentSimulation", "LandingBounds", "NothingToFlyError", "Replan"]
 
 _POSITION, _VELOCITY, _MASS = slice(0, 3), slice(3, 6), 6
-_RELATIVE_TOLERANCE = 1e-9
-_ABSOLUTE_TOLERANCE = 1e-6
-"""Metres, m/s and kg: far below what any dispersion does."""
 
 
-class NoFirstPlanError(DscpError):
-    """No certified plan from the first measured state: there is nothing to fly."""
+class NothingToFlyError(DscpError):
+    """No plan leads from the nominal start to the pad."""
 
 
 @dataclass(frozen=True)
-class Dispersions:
-    """Standard deviations of the normally distributed errors; 0 switches one off.
+class LandingBounds:
+    """What makes a landing a success."""
 
-    Attributes:
-        initial_position_m: Initial position, per axis.
-        initial_velocity_m_s: Initial velocity, per axis.
-        initial_mass: Initial mass, relative.
-        specific_impulse: Specific impulse, relative, constant in flight.
-        thrust: Thrust magnitude, relative, constant in flight.
-        thrust_direction_rad: Misalignment of the thrust about each lateral axis, constant.
-        navigation_position_m: Measured position, per axis, drawn for every measurement.
-        navigation_velocity_m_s: Measured velocity, likewise.
-        navigation_mass: Measured mass, relative, likewise.
-    """
-
-    initial_position_m: float = 50.0
-    initial_velocity_m_s: float = 3.0
-    initial_mass: float = 0.005
-    specific_impulse: float = 0.003
-    thrust: float = 0.003
-    thrust_direction_rad: float = 0.005
-    navigation_position_m: float = 0.2
-    navigation_velocity_m_s: float = 0.02
-    navigation_mass: float = 0.0005
+    contact_speed_most_m_s: float = option(0.5, "m/s", "Speed at contact.")
+    contact_position_most_m: float = option(1.0, "m", "Distance from the pad at contact.")
+    contact_tilt_most_rad: float = option(
+        math.radians(5.0), "rad", "Thrust off the vertical at contact."
+    )
 
     def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if not (math.isfinite(value) and value >= 0.0):
-                raise InvalidInputError(name, value, ">= 0")
+        validate(self)
 
 
 @dataclass(frozen=True)
-class SimulationOptions:
-    """How guidance runs.
+class DescentRecord(FlightRecord):
+    """One landing in full.
 
     Attributes:
-        tick_s: Time between measurements; the commanded thrust is held in between.
-        replan_ticks: Ticks from one plan to the next.
-        last_replan_s: With less time to go, the last plan is flown to its end.
-        thrust_reserve: Part of the greatest thrust that the first plan leaves unused. A plan that
-            burns at full thrust cannot make up for any error, so every later plan gets a little
-            more: what remains goes with the square root of the time to go.
-    """
-
-    tick_s: float = 0.1
-    replan_ticks: int = 10
-    last_replan_s: float = 1.5
-    thrust_reserve: float = 0.15
-
-    def __post_init__(self) -> None:
-        if not (math.isfinite(self.tick_s) and self.tick_s > 0.0):
-            raise InvalidInputError("tick_s", self.tick_s, "> 0")
-        if self.replan_ticks < 1:
-            raise InvalidInputError("replan_ticks", self.replan_ticks, ">= 1")
-        if not (math.isfinite(self.last_replan_s) and self.last_replan_s >= 0.0):
-            raise InvalidInputError("last_replan_s", self.last_replan_s, ">= 0")
-        if not 0.0 <= self.thrust_reserve < 1.0:
-            raise InvalidInputError("thrust_reserve", self.thrust_reserve, "[0, 1)")
-
-
-@dataclass(frozen=True)
-class VehicleErrors:
-    """What was drawn for one flight.
-
-    Attributes:
-        initial_state: (7,) difference from the nominal initial state, SI.
-        specific_impulse: Relative error.
-        thrust: Relative error of the magnitude.
-        thrust_direction_rad: (2,) rotation of the thrust about the core's y and z axes.
-    """
-
-    initial_state: Array
-    specific_impulse: float
-    thrust: float
-    thrust_direction_rad: Array
-
-
-@dataclass(frozen=True)
-class Replan:
-    """One planning attempt in flight.
-
-    Attributes:
-        tick: Index of the measurement it started from.
-        outcome: What came of it.
-        thrust_max_n: Greatest thrust that it was allowed to plan with.
-    """
-
-    tick: int
-    outcome: PlanOutcome
-    thrust_max_n: float
-
-
-@dataclass(frozen=True)
-class DescentRecord:
-    """One flight. Rows are ticks; the last row is the end of the flight.
-
-    Attributes:
-        times_s: (M,) from the start.
-        states: (M, 7) true states, SI, core axes (x up).
-        measured: (M, 7) measured states.
-        commanded: (M, 3) commanded thrust in N from each tick on; the last row repeats the one
-            before it.
-        thrusts: (M, 3) thrust of the engine, likewise.
         replans: Every planning attempt, in order.
         errors: What the vehicle did differently from what guidance assumed.
-        seed: Seed of the random numbers.
-        touched_down: Whether the flight ended on the ground, or else above it with the last plan.
-        miss_position_m: Distance from the target at the end.
-        miss_speed_m_s: Speed error at the end.
     """
 
-    times_s: Array
-    states: Array
-    measured: Array
-    commanded: Array
-    thrusts: Array
     replans: tuple[Replan, ...]
     errors: VehicleErrors
-    seed: int
-    touched_down: bool
-    miss_position_m: float
-    miss_speed_m_s: float
 
 
-def simulate_descent(
-    settings: PlannerSettings,
-    *,
-    seed: int,
-    dispersions: Dispersions | None = None,
-    options: SimulationOptions | None = None,
-) -> DescentRecord:
-    """Fly one powered descent under replanned guidance.
+class DescentSimulation:
+    """Landings of one vehicle under one guidance; a flight is a function of its seed alone.
 
-    Args:
-        settings: Vehicle, mission and how to plan; guidance assumes this vehicle.
-        seed: Seed of all random numbers. The same arguments give the same record.
-        dispersions: Size of the errors; those of `Dispersions` if None.
-        options: How guidance runs; those of `SimulationOptions` if None.
-
-    Raises:
-        InvalidInputError: A refused setting.
-        NoFirstPlanError: There is no certified plan from the first measured state.
+    Can be pickled; a copy compiles its own functions. Not safe for several threads.
     """
-    options = options or SimulationOptions()
-    random = np.random.default_rng(seed)
-    planner = Planner(powered_descent(), settings)
-    guidance = _Guidance(planner, options)
-    vehicle = _Vehicle(planner, dispersions or Dispersions(), random)
-    times, states, measured = [0.0], [vehicle.initial_state], []
-    commanded: list[Array] = []
-    thrusts: list[Array] = []
-    while True:
-        time_s, tick = times[-1], len(times) - 1
-        measured.append(vehicle.measure(states[-1], random))
-        if vehicle.touched_down or guidance.finished(time_s):
-            break
-        guidance.update(tick, time_s, measured[-1])
-        held_s = min(options.tick_s, guidance.time_to_go_s(time_s))
-        commanded.append(guidance.command(time_s, held_s))
-        thrusts.append(vehicle.thrust(commanded[-1]))
-        elapsed_s, state = vehicle.fly(states[-1], thrusts[-1], held_s)
-        # A tick's time is a product, not a sum, so that rounding does not build up.
-        whole = elapsed_s == options.tick_s
-        times.append((tick + 1) * options.tick_s if whole else time_s + elapsed_s)
-        states.append(state)
-    target = planner.problem.table.unpack(planner.parameters)
-    end = states[-1]
-    return DescentRecord(
-        times_s=np.array(times),
-        states=np.array(states),
-        measured=np.array(measured),
-        commanded=np.array([*commanded, commanded[-1]]),
-        thrusts=np.array([*thrusts, thrusts[-1]]),
-        replans=tuple(guidance.replans),
-        errors=vehicle.errors,
-        seed=seed,
-        touched_down=vehicle.touched_down,
-        miss_position_m=float(np.linalg.norm(end[_POSITION] - target["final_position"])),
-        miss_speed_m_s=float(np.linalg.norm(end[_VELOCITY] - target["final_velocity"])),
+
+    footprint = ("contact_y_m", "contact_z_m")
+
+    def __init__(self, planner: Planner, options: Mapping[str, Any] | None = None) -> None:
+        """Plan the nominal landing, for what suits the vehicle.
+
+        Args:
+            planner: Vehicle and mission as guidance assumes them, and how to plan.
+            options: What differs from that, by name, SI: options of `GuidanceSettings`,
+                `TruthSettings` and `LandingBounds`.
+
+        Raises:
+            InvalidInputError: An unknown option, a bad value, or thrust that does not carry the
+                vehicle.
+            NothingToFlyError: There is no plan from the nominal start.
+        """
+        chosen = _sorted(options or {})
+        self._options = dict(options or {})
+        # One of its own, which has planned nothing yet: what a solver was set up with stays in the
+        # last digits of its answers.
+        self.planner = copy.copy(planner)
+        self.values: Mapping[str, Any] = planner.problem.table.unpack(planner.parameters)
+        self.truth = TruthSettings.suited(self.values, **chosen[TruthSettings])
+        self.bounds = LandingBounds(**chosen[LandingBounds])
+        self.figures = _figures(self.bounds)
+        nominal = self.planner.plan()
+        if nominal.plan is None or not (nominal.certified or nominal.converged):
+            raise NothingToFlyError(nominal.headline)
+        self._landing_kg = float(nominal.plan.states[-1, _MASS])
+        self._longest_s = 3.0 * nominal.plan.terminal_time_s + 60.0
+        self.guidance = GuidanceSettings.suited(
+            self.values, self._landing_kg, **chosen[GuidanceSettings]
+        )
+        self._motion = TrueMotion()
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """By what it was made of; the copy compiles and plans the nominal landing again."""
+        return DescentSimulation, (self.planner, self._options)
+
+    @property
+    def settings(self) -> Mapping[str, Any]:
+        """Everything that decides a flight but its seed."""
+        how = self.planner.settings
+        return {
+            "vehicle": {n: np.asarray(v).tolist() for n, v in self.values.items()},
+            "planner": {
+                "intervals": how.intervals,
+                "terminal_time": how.terminal_time.value,
+                "hold": how.hold.value,
+                "solver": how.options.solver,
+            },
+            "guidance": values(self.guidance),
+            "truth": values(self.truth),
+            "bounds": values(self.bounds),
+        }
+
+    def fly(self, seed: int) -> FlightSummary:
+        """Fly once."""
+        return self.record(seed).summary
+
+    def record(self, seed: int) -> DescentRecord:
+        """Fly once, and keep everything."""
+        flight = Flight(self.planner, self._motion, self.values, self.guidance, self.truth, seed)
+        flight.fly(self._longest_s)
+        return DescentRecord(
+            summary=self._summary(flight, seed),
+            times_s=np.array(flight.times),
+            states=np.array(flight.states),
+            measured=np.array(flight.measured),
+            commanded=np.array(flight.commanded),
+            controls=np.array(flight.thrusts),
+            phases=tuple(flight.phases),
+            events=tuple(flight.events),
+            replans=tuple(flight.replans),
+            errors=flight.world.errors,
+        )
+
+    def optimum_kg(self, start: Array) -> float | None:
+        """Least propellant from a state (7,) to the pad with the nominal vehicle.
+
+        None where the planner finds no plan that converges.
+        """
+        outcome = self.planner.plan(start)
+        if outcome.plan is None or not outcome.converged:
+            return None
+        return float(start[_MASS] - outcome.plan.states[-1, _MASS])
+
+    def _summary(self, flight: Flight, seed: int) -> FlightSummary:
+        end, start = flight.states[-1], flight.states[0]
+        offset = end[_POSITION] - self.values["final_position"]
+        refused = sum(not r.flown for r in flight.replans)
+        figures = {
+            "contact_speed_m_s": float(np.linalg.norm(end[_VELOCITY])),
+            "contact_vertical_m_s": float(-end[3]),
+            "contact_lateral_m_s": float(np.linalg.norm(end[4:6])),
+            "contact_position_m": float(np.linalg.norm(offset)),
+            "contact_y_m": float(offset[1]),
+            "contact_z_m": float(offset[2]),
+            "contact_tilt_rad": _tilt_rad(flight.world.state[8:11]),
+            "fuel_kg": float(start[_MASS] - end[_MASS]),
+            "flight_s": flight.times[-1],
+            "replans": float(len(flight.replans)),
+            "refused_replans": float(refused),
+        }
+        optimum_kg = self.optimum_kg(start)
+        if optimum_kg is not None:
+            figures["fuel_over_optimum"] = figures["fuel_kg"] / optimum_kg - 1.0
+            vehicle = Vehicle.of(self.values)
+            hover_kg_s = self._landing_kg * vehicle.gravity_m_s2 / vehicle.exhaust_speed_m_s
+            if hover_kg_s > 0.0:
+                figures["excess_hover_s"] = (figures["fuel_kg"] - optimum_kg) / hover_kg_s
+        failure = ""
+        if flight.guidance.phase is Phase.WAITING:
+            failure = "no first plan"
+        elif not flight.world.landed:
+            failure = "no contact"
+        if not flight.world.landed:
+            figures = {n: v for n, v in figures.items() if not n.startswith("contact")}
+        worst = "" if failure else worst_of(self.figures, figures)
+        return FlightSummary(seed, figures, failure, worst, _story(figures, failure))
+
+
+def _tilt_rad(direction: Array) -> float:
+    return math.atan2(float(np.hypot(direction[1], direction[2])), float(direction[0]))
+
+
+def _story(figures: Mapping[str, float], failure: str) -> str:
+    if failure:
+        return f"{failure} after {figures['flight_s']:.1f} s"
+    return (
+        f"contact after {figures['flight_s']:.2f} s at {figures['contact_speed_m_s']:.2f} m/s, "
+        f"{figures['contact_position_m']:.2f} m from the pad, tilted by "
+        f"{math.degrees(figures['contact_tilt_rad']):.1f} deg; {figures['fuel_kg']:.5g} kg burnt"
     )
 
 
-class _Guidance:
-    """Replans at its period and commands the thrust of the last certified plan."""
+def _figures(bounds: LandingBounds) -> tuple[FlightFigure, ...]:
+    speed, position = bounds.contact_speed_most_m_s, bounds.contact_position_most_m
+    tilt = bounds.contact_tilt_most_rad
+    return (
+        FlightFigure("contact_speed_m_s", "m/s", "speed at contact", speed),
+        FlightFigure("contact_vertical_m_s", "m/s", "descent at contact"),
+        FlightFigure("contact_lateral_m_s", "m/s", "lateral speed at contact"),
+        FlightFigure("contact_position_m", "m", "distance from the pad at contact", position),
+        FlightFigure("contact_y_m", "m", "from the pad along y at contact"),
+        FlightFigure("contact_z_m", "m", "from the pad along z at contact"),
+        FlightFigure("contact_tilt_rad", "rad", "thrust off the vertical at contact", tilt),
+        FlightFigure("fuel_kg", "kg", "propellant burnt"),
+        FlightFigure("fuel_over_optimum", "1", "propellant above the optimum's, relative to it"),
+        FlightFigure("excess_hover_s", "s", "the same as time of hover before landing"),
+        FlightFigure("flight_s", "s", "time to contact"),
+        FlightFigure("replans", "1", "plans asked for"),
+        FlightFigure("refused_replans", "1", "of them not flown"),
+    )
 
-    def __init__(self, planner: Planner, options: SimulationOptions) -> None:
-        self.replans: list[Replan] = []
-        self._planner = planner
-        self._options = options
-        self._parameters = planner.parameters
-        self._plan: Plan | None = None
-        self._plan_start_s = 0.0
-        self._impulse = np.zeros((0, 3))
 
-    def time_to_go_s(self, time_s: float) -> float:
-        assert self._plan is not None
-        return self._plan_start_s + self._plan.terminal_time_s - time_s
+def _sorted(options: Mapping[str, Any]) -> dict[Any, dict[str, Any]]:
+    """Options by the settings that they belong to.
 
-    def finished(self, time_s: float) -> bool:
-        return self._plan is not None and self.time_to_go_s(time_s) <= 1e-9
+    Raises:
+        InvalidInputError: One that belongs to none.
+    """
+    owners = {p.name: kind for kind in _KINDS for p in declared(kind)}
+    chosen: dict[Any, dict[str, Any]] = {kind: {} for kind in _KINDS}
+    table = ParameterTable(p for kind in _KINDS for p in declared(kind))
+    for name, value in options.items():
+        chosen[owners[table[name].name]][name] = value
+    return chosen
 
-    def update(self, tick: int, time_s: float, measured: Array) -> None:
-        """Plan, if it is time to.
 
-        Raises:
-            NoFirstPlanError: There is no plan to fly.
-        """
-        if tick % self._options.replan_ticks:
-            return
-        if self._plan is not None and self.time_to_go_s(time_s) < self._options.last_replan_s:
-            return
-        thrust_max_n = self._thrust_limit_n(time_s)
-        table = self._planner.problem.table
-        self._planner.parameters = table.pack({"thrust_max": thrust_max_n}, self._parameters)
-        outcome = self._planner.plan(
-            measured, warm_start=self._plan, elapsed_s=time_s - self._plan_start_s
+class DescentSimulations:
+    """Makes simulations from options by name."""
+
+    @property
+    def options(self) -> tuple[Parameter, ...]:
+        """Those of guidance, truth and bounds; NaN stands for what suits the vehicle."""
+        return tuple(
+            replace(p, default=math.nan) if p.name in SUITED else p
+            for kind in _KINDS
+            for p in declared(kind)
         )
-        self.replans.append(Replan(tick, outcome, thrust_max_n))
-        if outcome.status is PlanStatus.CERTIFIED and outcome.plan is not None:
-            self._adopt(outcome.plan, time_s)
-        elif self._plan is None:
-            raise NoFirstPlanError(f"{outcome.status.name}: {outcome.message}")
 
-    def command(self, time_s: float, held_s: float) -> Array:
-        """Mean of the planned thrust over the time that it will be held."""
-        assert self._plan is not None
-        moments = np.array([0.0, held_s]) + (time_s - self._plan_start_s)
-        reached = [np.interp(moments, self._plan.times_s, axis) for axis in self._impulse.T]
-        return np.diff(np.array(reached), axis=1)[:, 0] / held_s
-
-    def _thrust_limit_n(self, time_s: float) -> float:
-        """Greatest thrust of the next plan: the reserve is given back as time runs out."""
-        thrust_max_n = float(self._parameters[self._planner.problem.table.slice("thrust_max")][0])
-        kept = 1.0
-        if self._plan is not None:
-            to_go_s = self.time_to_go_s(time_s)
-            kept = math.sqrt(to_go_s / (time_s + to_go_s))
-        return (1.0 - kept * self._options.thrust_reserve) * thrust_max_n
-
-    def _adopt(self, plan: Plan, time_s: float) -> None:
-        self._plan, self._plan_start_s = plan, time_s
-        # Between nodes, the mean of both is flown: that is what the midpoint rule assumes.
-        means = 0.5 * (plan.controls[1:] + plan.controls[:-1])
-        steps = np.diff(plan.times_s)[:, np.newaxis]
-        self._impulse = np.vstack([np.zeros(3), np.cumsum(means * steps, axis=0)])
+    def __call__(self, planner: Planner, options: Mapping[str, Any]) -> DescentSimulation:
+        """See `DescentSimulation`."""
+        return DescentSimulation(planner, options)
 
 
-class _Vehicle:
-    """The true vehicle and its navigation."""
-
-    def __init__(
-        self, planner: Planner, dispersions: Dispersions, random: np.random.Generator
-    ) -> None:
-        problem = planner.problem
-        nominal = planner.initial_state
-        spread = np.repeat(
-            [
-                dispersions.initial_position_m,
-                dispersions.initial_velocity_m_s,
-                dispersions.initial_mass * nominal[_MASS],
-            ],
-            [3, 3, 1],
-        )
-        self.errors = VehicleErrors(
-            initial_state=spread * random.standard_normal(7),
-            specific_impulse=dispersions.specific_impulse * random.standard_normal(),
-            thrust=dispersions.thrust * random.standard_normal(),
-            thrust_direction_rad=dispersions.thrust_direction_rad * random.standard_normal(2),
-        )
-        self.initial_state = nominal + self.errors.initial_state
-        self.touched_down = False
-        self._dispersions = dispersions
-        values = problem.table.unpack(planner.parameters)
-        impulse = float(values["specific_impulse"]) * (1.0 + self.errors.specific_impulse)
-        self._parameters = problem.table.pack({"specific_impulse": impulse}, planner.parameters)
-        self._thrust_bounds_n = float(values["thrust_min"]), float(values["thrust_max"])
-        self._ground_m = float(np.atleast_1d(values["final_position"])[0])
-        symbols = ca.SX.sym("x", 7), ca.SX.sym("u", 3), ca.SX.sym("p", problem.table.size)
-        x, u, p = symbols
-        rates = problem.dynamics(x, u, named(problem, p))
-        self._rates = CompiledFunction("rates", list(symbols), [rates])
-
-    def measure(self, state: Array, random: np.random.Generator) -> Array:
-        """State as navigation sees it."""
-        noise = random.standard_normal(7)
-        noise[_POSITION] *= self._dispersions.navigation_position_m
-        noise[_VELOCITY] *= self._dispersions.navigation_velocity_m_s
-        noise[_MASS] *= self._dispersions.navigation_mass * state[_MASS]
-        return np.asarray(state + noise)
-
-    def thrust(self, commanded: Array) -> Array:
-        """What the engine makes of a command: scaled, within its bounds, misaligned."""
-        low, high = self._thrust_bounds_n
-        size = float(np.linalg.norm(commanded))
-        made = min(max((1.0 + self.errors.thrust) * size, low), high)
-        about_y, about_z = self.errors.thrust_direction_rad
-        # Rotation vector (0, about_y, about_z) crossed with the thrust: first order is enough for
-        # a misalignment, and the size is restored below.
-        turned = commanded + np.cross([0.0, about_y, about_z], commanded)
-        return np.asarray(turned * (made / np.linalg.norm(turned)))
-
-    def fly(self, state: Array, thrust: Array, duration_s: float) -> tuple[float, Array]:
-        """Time flown and state then, at the end of the duration or at touchdown."""
-
-        def altitude(_: float, x: Array) -> float:
-            return float(x[0]) - self._ground_m
-
-        altitude.terminal, altitude.direction = True, -1.0  # type: ignore[attr-defined]
-        flown = scipy.integrate.solve_ivp(
-            lambda _, x: self._rates(x, thrust, self._parameters)[0],
-            (0.0, duration_s),
-            state,
-            method="DOP853",
-            rtol=_RELATIVE_TOLERANCE,
-            atol=_ABSOLUTE_TOLERANCE,
-            events=altitude,
-        )
-        self.touched_down = flown.status == 1
-        return float(flown.t[-1]), np.asarray(flown.y[:, -1])
+_KINDS: tuple[Any, ...] = (GuidanceSettings, TruthSettings, LandingBounds)
+SUITED = frozenset((*GuidanceSettings.SUITED, *TruthSettings.SUITED))
+"""Options whose default follows from vehicle and mission."""

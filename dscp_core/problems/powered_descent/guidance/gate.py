@@ -1,0 +1,132 @@
+"""Plans to the gate: when to ask for one, with which limits, and which one to keep."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from dscp_core.planning.plan import PlanOutcome
+from dscp_core.problem.flight import ControlHold
+from dscp_core.problem.trajectory import Plan
+from dscp_core.problems.powered_descent.guidance.reference import Reference
+from dscp_core.problems.powered_descent.guidance.settings import GuidanceSettings
+from dscp_core.problems.powered_descent.guidance.vehicle import Array, Motion, Vehicle
+
+_RELEASED = (1.0, 0.5, 0.0)
+"""Part of the reserve that a plan keeps, after so many refusals in a row."""
+
+
+@dataclass(frozen=True)
+class PlanRequest:
+    """What guidance asks a planner for.
+
+    Attributes:
+        made_at_s: When it is asked.
+        start_s: When the plan is to begin.
+        state: (7,) expected then, SI, core axes.
+        parameters: Those of the planner that differ from the mission's, by name, SI.
+        warm_start: The plan that is flown, to start from, or None.
+        elapsed_s: Time between that plan's beginning and this one's.
+        reserve: Part of the greatest thrust that the plan leaves.
+    """
+
+    made_at_s: float
+    start_s: float
+    state: Array
+    parameters: Mapping[str, Any]
+    warm_start: Plan | None
+    elapsed_s: float
+    reserve: float
+
+
+class GatePlanning:
+    """Asks for plans, and keeps the one that is flown."""
+
+    def __init__(
+        self,
+        settings: GuidanceSettings,
+        vehicle: Vehicle,
+        values: Mapping[str, Any],
+        hold: ControlHold,
+    ) -> None:
+        self._settings, self._vehicle, self._hold = settings, vehicle, hold
+        self._final_velocity = np.asarray(values["final_velocity"], dtype=np.float64)
+        self.kept: Reference | None = None
+        self._first_start_s = 0.0
+        self._asked: PlanRequest | None = None
+        self._next_s = -math.inf
+        self._refused = 0
+
+    def due(self, time_s: float) -> bool:
+        """Whether a plan should be asked for now."""
+        asked = self._asked
+        if asked is not None and time_s < asked.made_at_s + self._settings.answer_timeout_s:
+            return False
+        if time_s < self._next_s - 1e-9:
+            return False
+        return self.kept is None or self.kept.end_s - time_s >= self._settings.last_replan_s
+
+    def start_s(self, time_s: float) -> float:
+        """When a plan that is asked for now can come into effect: at the tick after it came."""
+        settings = self._settings
+        ticks = math.ceil(settings.known_planning_latency_s / settings.tick_s - 1e-9)
+        return time_s + ticks * settings.tick_s + settings.known_command_latency_s
+
+    def request(self, time_s: float, expected: Motion) -> PlanRequest:
+        """Ask for a plan from what is expected at its start."""
+        reserve = self._reserve(expected.time_s) * _RELEASED[min(self._refused, 2)]
+        vehicle, kept = self._vehicle, self.kept
+        least = vehicle.thrust_min_n * (1.0 + self._settings.floor_reserve)
+        gate = vehicle.pad_m + np.array([self._settings.gate_altitude_m, 0.0, 0.0])
+        descent = [-self._settings.gate_descent_m_s, 0.0, 0.0]
+        self._asked = PlanRequest(
+            made_at_s=time_s,
+            start_s=expected.time_s,
+            state=np.array([*expected.position, *expected.velocity, expected.mass]),
+            parameters={
+                "thrust_max": max((1.0 - reserve) * vehicle.thrust_max_n, least),
+                "thrust_min": least,
+                "final_position": gate,
+                "final_velocity": descent,
+            },
+            warm_start=None if kept is None else kept.plan,
+            elapsed_s=0.0 if kept is None else expected.time_s - kept.start_s,
+            reserve=reserve,
+        )
+        self._next_s = time_s + self._settings.replan_s
+        return self._asked
+
+    def take(self, request: PlanRequest, outcome: PlanOutcome, now_s: float) -> bool:
+        """Take an answer, however late; whether its plan is kept.
+
+        A plan is flown on from where it would be by now. It is refused if it is not certified, is
+        over, or began before the one that is flown. After a refusal the next plan is asked for at
+        once, with half of the reserve, then with none; the old one is flown on meanwhile.
+        """
+        if self._asked is request:
+            self._asked = None
+        if not outcome.certified or outcome.plan is None:
+            self._refused += 1
+            if self._refused < len(_RELEASED):
+                self._next_s = now_s
+            return False
+        self._refused = 0
+        reference = Reference(outcome.plan, request.start_s, self._hold)
+        kept = self.kept
+        if reference.end_s <= now_s or (kept is not None and kept.start_s >= reference.start_s):
+            return False
+        if kept is None:
+            self._first_start_s = reference.start_s
+        self.kept = reference
+        return True
+
+    def _reserve(self, start_s: float) -> float:
+        early = self._settings.early_reserve
+        if self.kept is not None:
+            to_go_s = max(self.kept.end_s - start_s, 0.0)
+            early *= math.sqrt(to_go_s / max(self.kept.end_s - self._first_start_s, 1e-9))
+        return self._settings.reserve + early

@@ -1,0 +1,61 @@
+"""Thrust commands: along a plan, and along the altitude-speed profile of the last stretch."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from dscp_core.problems.powered_descent.guidance.reference import Reference
+from dscp_core.problems.powered_descent.guidance.settings import GuidanceSettings
+from dscp_core.problems.powered_descent.guidance.vehicle import Array, Motion, Vehicle
+
+_MOST_STEEPER = 4.0
+"""Feed-forward is at most so many times the profile's deceleration."""
+
+
+def tracking_thrust(
+    settings: GuidanceSettings, vehicle: Vehicle, plan: Reference, now: Motion, bias: Array
+) -> Array:
+    """Thrust (3,) in N that follows a plan; it may spend the reserve that the plan keeps.
+
+    The plan's thrust is commanded one lag ahead, as acceleration: the mass is another by now.
+
+    Args:
+        settings: Gains.
+        vehicle: Its limits.
+        plan: What is followed.
+        now: The motion when the command comes into effect.
+        bias: (3,) observed acceleration that the model leaves out, m/s^2.
+    """
+    position, velocity, mass = plan.state(now.time_s)
+    ahead_s = now.time_s + settings.known_lag_s
+    force = plan.thrust(ahead_s, settings.tick_s) * (now.mass / mass)
+    correction = (
+        settings.tracking_position_gain * (position - now.position)
+        + settings.tracking_velocity_gain * (velocity - now.velocity)
+        - bias
+    )
+    return vehicle.limited(force + now.mass * correction, vehicle.pointing_angle_max_rad)
+
+
+def profile_thrust(settings: GuidanceSettings, vehicle: Vehicle, now: Motion, bias: Array) -> Array:
+    """Thrust (3,) in N along the altitude-speed profile, upright towards the ground.
+
+    The feed-forward is the deceleration that the profile needs at the vehicle's own descent, not
+    at the profile's: it vanishes where the vehicle stands still.
+    """
+    offset = now.position - vehicle.pad_m
+    altitude, descent = float(offset[0]), -float(now.velocity[0])
+    wanted = settings.profile_descent_m_s(altitude)
+    steeper = min(max(descent / max(wanted, 1e-3), 0.0), _MOST_STEEPER)
+    # At the end of the profile the descent is constant.
+    slope = settings.profile_deceleration_m_s2 if altitude > settings.contact_margin_m else 0.0
+    up = vehicle.gravity_m_s2 + slope * steeper + settings.descent_gain * (descent - wanted)
+    aside = (
+        -settings.lateral_position_gain * offset[1:3]
+        - settings.lateral_velocity_gain * now.velocity[1:3]
+    )
+    tilt = settings.contact_tilt_max_rad + settings.tilt_per_altitude_rad_m * max(altitude, 0.0)
+    wanted_force = now.mass * (np.array([up, *aside]) - bias)
+    return vehicle.limited(wanted_force, min(tilt, 0.5 * math.pi))
