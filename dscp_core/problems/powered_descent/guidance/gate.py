@@ -16,8 +16,10 @@ from dscp_core.problems.powered_descent.guidance.reference import Reference
 from dscp_core.problems.powered_descent.guidance.settings import GuidanceSettings
 from dscp_core.problems.powered_descent.guidance.vehicle import Array, Motion, Vehicle
 
-_RELEASED = (1.0, 0.5, 0.0)
+_RELEASED = (1.0, 0.8, 0.5, 0.0)
 """Part of the reserve that a plan keeps, after so many refusals in a row."""
+_RECOVERED = 0.05
+"""Part of the reserve that the next plan keeps again."""
 
 
 @dataclass(frozen=True)
@@ -60,6 +62,7 @@ class GatePlanning:
         self._asked: PlanRequest | None = None
         self._next_s = -math.inf
         self._refused = 0
+        self._level = 1.0
 
     def due(self, time_s: float) -> bool:
         """Whether a plan should be asked for now."""
@@ -78,7 +81,7 @@ class GatePlanning:
 
     def request(self, time_s: float, expected: Motion) -> PlanRequest:
         """Ask for a plan from what is expected at its start."""
-        reserve = self._reserve(expected.time_s) * _RELEASED[min(self._refused, 2)]
+        reserve = self._reserve(expected.time_s) * self._level * self._released
         vehicle, kept = self._vehicle, self.kept
         least = vehicle.thrust_min_n * (1.0 + self._settings.floor_reserve)
         gate = vehicle.pad_m + np.array([self._settings.gate_altitude_m, 0.0, 0.0])
@@ -105,7 +108,8 @@ class GatePlanning:
 
         A plan is flown on from where it would be by now. It is refused if it is not certified, is
         over, or began before the one that is flown. After a refusal the next plan is asked for at
-        once, with half of the reserve, then with none; the old one is flown on meanwhile.
+        once, with less and less of the reserve, at last with none; the old one is flown on
+        meanwhile. What was released comes back little by little.
         """
         if self._asked is request:
             self._asked = None
@@ -114,6 +118,7 @@ class GatePlanning:
             if self._refused < len(_RELEASED):
                 self._next_s = now_s
             return False
+        self._level = min(self._level * self._released + _RECOVERED, 1.0)
         self._refused = 0
         reference = Reference(outcome.plan, request.start_s, self._hold)
         kept = self.kept
@@ -123,6 +128,10 @@ class GatePlanning:
             self._first_start_s = reference.start_s
         self.kept = reference
         return True
+
+    @property
+    def _released(self) -> float:
+        return _RELEASED[min(self._refused, len(_RELEASED) - 1)]
 
     def _reserve(self, start_s: float) -> float:
         early = self._settings.early_reserve

@@ -11,7 +11,11 @@ import numpy as np
 from dscp_core.planning.plan import PlanOutcome
 from dscp_core.problem.flight import ControlHold
 from dscp_core.problems.powered_descent.guidance.gate import GatePlanning, PlanRequest
-from dscp_core.problems.powered_descent.guidance.laws import profile_thrust, tracking_thrust
+from dscp_core.problems.powered_descent.guidance.laws import (
+    contact_speed_m_s,
+    profile_thrust,
+    tracking_thrust,
+)
 from dscp_core.problems.powered_descent.guidance.observer import Observer
 from dscp_core.problems.powered_descent.guidance.settings import GuidanceSettings
 from dscp_core.problems.powered_descent.guidance.vehicle import Array, Engine, Motion, Vehicle
@@ -90,6 +94,8 @@ class LandingGuidance:
         if self.phase is Phase.WAITING:
             return None
         force = self._thrust(now)
+        if self.phase is Phase.PROFILE and self._is_time_to_cut_off(now, force):
+            self.phase, force = Phase.CUT_OFF, np.zeros(3)
         self._engine.command(time_s, force)
         return force if self.phase is not Phase.CUT_OFF else None
 
@@ -104,10 +110,19 @@ class LandingGuidance:
             low = altitude <= self.vehicle.pad_m[0] + settings.gate_altitude_m
             if low or now.time_s + settings.known_lag_s >= kept.end_s:
                 return Phase.PROFILE
-        slow = -now.velocity[0] < settings.cutoff_descent_m_s
-        if self.phase is Phase.PROFILE and slow and settings.cutoff_descent_m_s > 0.0:
-            return Phase.CUT_OFF
         return self.phase
+
+    def _is_time_to_cut_off(self, now: Motion, force: Array) -> bool:
+        """Whether another tick of thrust would end harder than none."""
+        settings, pad_m = self.settings, float(self.vehicle.pad_m[0])
+        braking = now.thrust_n / now.mass * (settings.known_lag_s + 2.0 * settings.tick_s)
+        if not settings.cut_off or -now.velocity[0] > braking + settings.contact_descent_m_s:
+            return False
+        at_once, later = (
+            contact_speed_m_s(self._engine, pad_m, now, force, held_s, self.observer.bias)
+            for held_s in (0.0, settings.tick_s)
+        )
+        return at_once <= later
 
     def _thrust(self, now: Motion) -> Array:
         if self.phase is Phase.CUT_OFF:

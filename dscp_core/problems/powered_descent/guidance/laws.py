@@ -8,8 +8,10 @@ import numpy as np
 
 from dscp_core.problems.powered_descent.guidance.reference import Reference
 from dscp_core.problems.powered_descent.guidance.settings import GuidanceSettings
-from dscp_core.problems.powered_descent.guidance.vehicle import Array, Motion, Vehicle
+from dscp_core.problems.powered_descent.guidance.vehicle import Array, Engine, Motion, Vehicle
 
+_FALL_S, _LONGEST_FALL_S = 0.01, 2.0
+"""Step of a foreseen fall, and how far it is foreseen."""
 _MOST_STEEPER = 4.0
 """Feed-forward is at most so many times the profile's deceleration."""
 
@@ -59,3 +61,17 @@ def profile_thrust(settings: GuidanceSettings, vehicle: Vehicle, now: Motion, bi
     tilt = settings.contact_tilt_max_rad + settings.tilt_per_altitude_rad_m * max(altitude, 0.0)
     wanted_force = now.mass * (np.array([up, *aside]) - bias)
     return vehicle.limited(wanted_force, min(tilt, 0.5 * math.pi))
+
+
+def contact_speed_m_s(
+    engine: Engine, pad_altitude_m: float, now: Motion, force: Array, held_s: float, bias: Array
+) -> float:
+    """Foreseen vertical speed at contact, if a command is held for a time, and then nothing.
+
+    The engine goes on thrusting while it runs down. A fall longer than two seconds is cut there.
+    """
+    motion, off = now, np.zeros(3)
+    while motion.position[0] > pad_altitude_m and motion.time_s < now.time_s + _LONGEST_FALL_S:
+        lit = motion.time_s < now.time_s + held_s - 1e-9
+        motion = engine.step(motion, _FALL_S, force if lit else off, bias)
+    return abs(float(motion.velocity[0]))

@@ -126,10 +126,12 @@ class GuidanceSettings:
     tilt_per_altitude_rad_m: float = option(
         2.0 * _DEGREE, "rad/m", "More of it per altitude.", source=_SCALED
     )
-    cutoff_descent_m_s: float = option(
+    cut_off: float = option(
         0.0,
-        "m/s",
-        "Observed descent below which the engine goes off for good; 0 for a vehicle that hovers.",
+        "1",
+        "1 for a vehicle that cannot hover: the engine goes off for good where a tick later the "
+        "landing would be harder.",
+        upper=1.0,
         source=_SCALED,
     )
 
@@ -143,7 +145,7 @@ class GuidanceSettings:
         "lateral_position_gain",
         "lateral_velocity_gain",
         "tilt_per_altitude_rad_m",
-        "cutoff_descent_m_s",
+        "cut_off",
     )
 
     def __post_init__(self) -> None:
@@ -197,13 +199,15 @@ class GuidanceSettings:
         if least < -0.05 * gravity:
             own = {"profile_deceleration_m_s2": min(0.41 * gravity, 0.35 * most)}
         else:
+            # Least thrust has to leave authority downwards: else it stops metres up, and falls.
+            braking = max(least, 0.0) + max(3.5, 0.3 * least)
             own = {
-                "profile_deceleration_m_s2": max(least, 0.0) + 0.15 * (most - max(least, 0.0)),
+                "profile_deceleration_m_s2": braking,
                 "contact_descent_m_s": 0.5,
                 "contact_margin_m": 0.0,
-                "cutoff_descent_m_s": 0.2,
+                "cut_off": 1.0,
                 "floor_reserve": 0.05,
-                "tick_s": 0.05,
+                "tick_s": min(max(0.35 / braking, 0.02), 0.05),
             }
         lasts_s = 1.7 / swift
         gate_m = 0.12 + 0.5 * own["profile_deceleration_m_s2"] * lasts_s**2

@@ -138,12 +138,13 @@ class Engine:
             index = bisect.bisect_right(times, motion.time_s + 1e-9)
             end_s = min(until_s, motion.time_s + _STEP_S, *times[index : index + 1])
             force = forces[index - 1] if index else None
-            motion = self._step(motion, end_s - motion.time_s, force, acceleration)
+            motion = self.step(motion, end_s - motion.time_s, force, acceleration)
         return motion
 
-    def _step(
+    def step(
         self, motion: Motion, step_s: float, force: Array | None, acceleration: Array
     ) -> Motion:
+        """The motion a short time later, under a command (3,) in N that is in effect meanwhile."""
         half_thrust, half_direction = self._answer(motion, 0.5 * step_s, force)
         flow = half_thrust / self._vehicle.exhaust_speed_m_s
         mass = motion.mass - 0.5 * step_s * flow

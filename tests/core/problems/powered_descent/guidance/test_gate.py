@@ -72,18 +72,18 @@ def test_refusals_spend_the_reserve_and_keep_the_old_plan(
     assert planning.take(ask(planning, 0.0), outcome, 0.1)
     kept, refusal = planning.kept, replace(outcome, status=PlanStatus.INFEASIBLE)
     reserves = []
-    for time_s in (1.0, 1.1, 1.2):
+    for time_s in (1.0, 1.1, 1.2, 1.3):
         assert planning.due(time_s)
         request = ask(planning, time_s)
         reserves.append(request.reserve)
         assert not planning.take(request, refusal, time_s + 0.02)
         assert planning.kept is kept
-    assert reserves[1] == pytest.approx(0.5 * reserves[0], rel=0.01)
-    assert reserves[2] == 0.0
-    assert not planning.due(1.3)  # everything was tried: the period again
-    assert planning.due(2.2)
-    assert planning.take(ask(planning, 2.2), outcome, 2.3)
-    assert ask(planning, 3.2).reserve > 0.03
+    assert reserves[1:3] == pytest.approx([0.8 * reserves[0], 0.5 * reserves[0]], rel=0.02)
+    assert reserves[3] == 0.0
+    assert not planning.due(1.4)  # everything was tried: the period again
+    assert planning.due(2.3)
+    assert planning.take(ask(planning, 2.3), outcome, 2.4)
+    assert 0.0 < ask(planning, 3.3).reserve < 0.01  # it comes back little by little
 
 
 def test_a_late_plan_is_flown_from_where_it_would_be(

@@ -103,7 +103,7 @@ def test_a_vehicle_that_cannot_hover_has_another_law() -> None:
     # Least thrust of 338 kN on 24.2 t brakes by 4.2 m/s^2.
     values = {**VALUES, "thrust_min": 338080.0}
     settings = GuidanceSettings.suited(values, 24245.0)
-    assert settings.cutoff_descent_m_s > 0.0
+    assert settings.cut_off == 1.0
     assert settings.profile_deceleration_m_s2 > 338080.0 / 24245.0 - VEHICLE.gravity_m_s2
     with pytest.raises(InvalidInputError, match="weight at landing"):
         GuidanceSettings.suited(values, 1e6)
