@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from dscp_core.studies.grid import Item, Row
+from dscp_core.workers.grid import Item, Row
 
 
 @dataclass(frozen=True)

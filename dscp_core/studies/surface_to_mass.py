@@ -20,13 +20,13 @@ from dscp_core.errors import InvalidInputError
 from dscp_core.gradients.differences import RunDifferences, relative_error
 from dscp_core.gradients.losses import CostLoss
 from dscp_core.gradients.run import DifferentiationError, Gradient, unrolled
-from dscp_core.studies.grid import Item, Row
 from dscp_core.studies.trust_region_cases import (
     CASES,
     FALSE_STOP_DEFECT,
     MOST_ITERATIONS,
     EntryRuns,
 )
+from dscp_core.workers.grid import Item, Row
 
 Array = NDArray[np.float64]
 

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from dscp_core.planning.panels import draw_panel_style
-from dscp_core.studies.grid import Item, Row
 from dscp_core.studies.surface_to_mass import (
     PAPER,
     changes_count,
@@ -20,6 +19,7 @@ from dscp_core.studies.surface_to_mass import (
 )
 from dscp_core.studies.trust_region_cases import CASES
 from dscp_core.studies.trust_region_figures import CASE_COLOURS
+from dscp_core.workers.grid import Item, Row
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

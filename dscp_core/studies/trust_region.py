@@ -19,13 +19,13 @@ from dscp_core.gradients.losses import ConvergenceLoss, LogConvergenceLoss
 from dscp_core.gradients.run import DifferentiationError, Gradient, unrolled
 from dscp_core.problems.entry import physics
 from dscp_core.scp.trace import ScpResult, ScpStatus
-from dscp_core.studies.grid import Item, Row
 from dscp_core.studies.trust_region_cases import (
     CASES,
     FALSE_STOP_DEFECT,
     MOST_ITERATIONS,
     EntryRuns,
 )
+from dscp_core.workers.grid import Item, Row
 
 Array = NDArray[np.float64]
 

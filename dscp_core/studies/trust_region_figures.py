@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dscp_core.planning.panels import LIMIT, PLANNED, draw_panel_style
-from dscp_core.studies.grid import Row
 from dscp_core.studies.trust_region import BASIN, converged, false_stop, fastest_step
 from dscp_core.studies.trust_region_cases import CASES, MOST_ITERATIONS
+from dscp_core.workers.grid import Row
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -17,9 +17,9 @@ from dscp_ros.cli.output_files import check_folder, complete_file, write_csv
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from dscp_core.studies.grid import GridResult, Item, Row
     from dscp_core.studies.surface_to_mass import SurfaceToMassRow
     from dscp_core.studies.trust_region import TrustRegionSummary
+    from dscp_core.workers.grid import GridResult, Item, Row
 
 TRUST_REGION_DESCRIPTION = """\
 Solves the paper's entry trajectory over a grid of trust-region weights w_gamma and w_u (its
@@ -193,8 +193,8 @@ def _compute(
     check_folder(args.output)
     from tqdm import tqdm
 
-    from dscp_core.studies.grid import code_version, discard, run_grid
     from dscp_core.workers.choice import make_engine
+    from dscp_core.workers.grid import code_version, discard, run_grid
 
     path = args.output / name
     if args.restart:

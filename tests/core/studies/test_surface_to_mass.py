@@ -11,7 +11,6 @@ import pytest
 
 from dscp_core.errors import InvalidInputError
 from dscp_core.studies import surface_to_mass_figures as figures
-from dscp_core.studies.grid import Item, Row
 from dscp_core.studies.surface_to_mass import (
     FULL_POINTS,
     LARGEST_ERROR,
@@ -23,6 +22,7 @@ from dscp_core.studies.surface_to_mass import (
     sweep_items,
 )
 from dscp_core.studies.trust_region_cases import CASES
+from dscp_core.workers.grid import Item, Row
 
 
 @pytest.fixture(scope="module")

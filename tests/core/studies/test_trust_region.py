@@ -14,7 +14,6 @@ from dscp_core.errors import InvalidInputError
 from dscp_core.gradients.losses import ConvergenceLoss
 from dscp_core.gradients.run import unrolled
 from dscp_core.studies import trust_region_figures as figures
-from dscp_core.studies.grid import Item, Row
 from dscp_core.studies.trust_region import (
     TrustRegionModel,
     converged,
@@ -24,6 +23,7 @@ from dscp_core.studies.trust_region import (
     summarise,
 )
 from dscp_core.studies.trust_region_cases import CASES, FALSE_STOP_DEFECT, EntryRuns
+from dscp_core.workers.grid import Item, Row
 
 
 @pytest.fixture(scope="module")

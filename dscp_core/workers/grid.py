@@ -1,7 +1,8 @@
 """A grid of points that survives interruptions: every result is kept as soon as it is there.
 
-Results are lines of a file that is only appended to: a checksum, a space, and JSON. What a killed
-process or a full disk leaves half-written fails its checksum and is computed again.
+Results are JSON Lines in a file that is only appended to; the last member of each line is the
+checksum of what stands before it. What a killed process or a full disk leaves half-written fails
+its checksum and is computed again.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import fcntl
 import hashlib
 import json
 import os
+import re
 import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -23,7 +25,8 @@ from dscp_core.workers.engine import Engine
 Item: TypeAlias = tuple[str | int | float, ...]
 Row: TypeAlias = Mapping[str, Any]
 
-FORMAT = "dscp-grid-1"
+FORMAT = "dscp-grid-2"
+_CHECKSUM = re.compile(rb'(.*),"crc32":"([0-9a-f]{8})"}', re.DOTALL)
 
 
 class GridFileError(DscpError):
@@ -113,8 +116,8 @@ class _GridFile:
         self.rows[item] = json.loads(json.dumps(row))
 
     def _write(self, document: Row) -> None:
-        text = json.dumps(document, allow_nan=False, separators=(",", ":"))
-        line = f"{zlib.crc32(text.encode()):08x} {text}\n".encode()
+        text = json.dumps(document, allow_nan=False, separators=(",", ":"))[:-1]
+        line = f'{text},"crc32":"{zlib.crc32(text.encode()):08x}"}}\n'.encode()
         try:
             written = os.write(self._descriptor, line)
             os.fsync(self._descriptor)
@@ -156,10 +159,10 @@ class _GridFile:
 
 def _document(line: bytes) -> dict[str, Any] | None:
     """A line's content; None where it does not fit its checksum."""
-    checksum, _, text = line.partition(b" ")
-    if checksum != f"{zlib.crc32(text):08x}".encode():
+    found = _CHECKSUM.fullmatch(line)
+    if found is None or found[2] != f"{zlib.crc32(found[1]):08x}".encode():
         return None
-    content: dict[str, Any] = json.loads(text)
+    content: dict[str, Any] = json.loads(found[1] + b"}")
     return content
 
 

@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 from study_support import Counting
 
-from dscp_core.studies.grid import GridFileError, GridResult, Item, code_version, discard, run_grid
+from dscp_core.workers.grid import GridFileError, GridResult, Item, code_version, discard, run_grid
 from dscp_core.workers.processes import ProcessEngine, SerialEngine
 
 IDENTITY = {"study": "toy", "tolerance": 1e-3}
@@ -69,7 +69,7 @@ def test_killed_in_the_middle(path: Path, log: Path, tmp_path: Path) -> None:
         "from pathlib import Path\n"
         "from study_support import Counting\n"
         "from dscp_core.workers.processes import ProcessEngine\n"
-        "from dscp_core.studies.grid import run_grid\n"
+        "from dscp_core.workers.grid import run_grid\n"
         "if __name__ == '__main__':\n"
         f"    items = [('point', n, 0.1 * n) for n in range(2000)]\n"
         f"    setup = Counting(Path({str(log)!r}), seconds=0.01)\n"
@@ -127,7 +127,8 @@ def test_killed_while_the_file_was_begun(path: Path, log: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "content", [b"name,value\n1,2\n", b'00000000 {"format":"dscp-grid-1"}\n', b"\0\0\0\n\0"]
+    "content",
+    [b"name,value\n1,2\n", b'{"format":"dscp-grid-2","crc32":"00000000"}\n', b"\0\0\0\n\0"],
 )
 def test_a_file_of_something_else_is_left_alone(path: Path, log: Path, content: bytes) -> None:
     path.parent.mkdir()
@@ -178,5 +179,5 @@ def test_nan_is_refused_and_rows_are_json(path: Path) -> None:
     with pytest.raises(ValueError, match="JSON"):
         run_grid(path, IDENTITY, [("nan",)], lambda: SerialEngine(lambda: lambda _: {"x": 1e999}))
     for line in path.read_bytes().splitlines():
-        json.loads(line.partition(b" ")[2])
+        json.loads(line)
     assert os.access(path, os.W_OK)
