@@ -23,7 +23,7 @@ FLOORS = (
     ("gradients",),
     ("planning",),
     ("problems", "workers"),
-    ("learning",),
+    ("campaigns", "learning"),
     ("tuning", "studies"),
 )
 FACE = "dscp_core"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -139,3 +140,22 @@ class Scene:
 
 SceneOf = Callable[[Plan, Mapping[str, Any], Mapping[str, Any]], Scene]
 """Scene of a plan, its parameters by name (SI) and the settings of `Messages` by name."""
+
+
+def quaternion_from_z_axis(direction: Array) -> Array:
+    """Shortest rotation that takes +z to ``direction``, as (x, y, z, w).
+
+    A zero direction gives the identity. Straight down is a half turn about x.
+    """
+    norm = math.hypot(*direction)
+    if norm == 0.0:
+        return np.array([0.0, 0.0, 0.0, 1.0])
+    x, y, z = (float(component) / norm for component in direction)
+    # Half-angle form: (1 + cos) = 2 cos^2(angle / 2); it vanishes only for straight down.
+    scalar = math.sqrt(max(0.0, (1.0 + z) / 2.0))
+    # Below, sin(angle/2) * axis = (-y, x, 0) / (2 scalar), which is 0/0 for straight down.
+    if scalar < 1e-9:
+        return np.array([1.0, 0.0, 0.0, 0.0])
+    quaternion = np.array([-y / (2.0 * scalar), x / (2.0 * scalar), 0.0, scalar])
+    unit: Array = quaternion / np.linalg.norm(quaternion)
+    return unit

@@ -15,6 +15,9 @@ from dscp_core.problem.parameters import Parameter
 
 Array = NDArray[np.float64]
 
+DISPERSION = "dispersion"
+"""Option of truth that many simulations have: a factor on all random errors."""
+
 
 @dataclass(frozen=True)
 class FlightFigure:
@@ -25,15 +28,22 @@ class FlightFigure:
         unit: SI unit; ``"1"`` for a pure number.
         description: What it is.
         most: A flight succeeds only with at most this; infinite where it is not judged.
+        excess: What a flight above that is called, such as ``hard``.
     """
 
     name: str
     unit: str
     description: str
     most: float = math.inf
+    excess: str = ""
 
     def __post_init__(self) -> None:
         checks.named("name of a figure", self.name)
+
+    @property
+    def judged(self) -> bool:
+        """Whether success depends on it."""
+        return math.isfinite(self.most)
 
 
 @dataclass(frozen=True)
@@ -83,6 +93,7 @@ class FlightRecord:
         controls: (M, nu) what the actuators were doing at that time.
         phases: (M,) of guidance.
         events: Time in s, and what happened then.
+        histories: (M,) each: one to six that show how it went, by name with unit.
     """
 
     summary: FlightSummary
@@ -93,6 +104,7 @@ class FlightRecord:
     controls: Array
     phases: tuple[str, ...]
     events: tuple[tuple[float, str], ...]
+    histories: Mapping[str, Array]
 
 
 class Simulation(Protocol):
@@ -129,8 +141,18 @@ class Simulated(Protocol):
     """Makes the simulations of a problem."""
 
     @property
-    def options(self) -> tuple[Parameter, ...]:
-        """What can be chosen; a default of NaN stands for what suits the vehicle."""
+    def truth(self) -> tuple[Parameter, ...]:
+        """What can be chosen of the world; a default of NaN stands for what suits the vehicle."""
+        ...
+
+    @property
+    def guidance(self) -> tuple[Parameter, ...]:
+        """Of guidance, likewise. No name is in two of the three."""
+        ...
+
+    @property
+    def bounds(self) -> tuple[Parameter, ...]:
+        """Of success, likewise."""
         ...
 
     def __call__(self, planner: Any, options: Mapping[str, Any]) -> Simulation:
@@ -138,7 +160,7 @@ class Simulated(Protocol):
 
         Args:
             planner: A `dscp_core.planning.planner.Planner`: vehicle, mission and how to plan.
-            options: By name, SI.
+            options: Of all three by name, SI.
 
         Raises:
             InvalidInputError: An unknown option or a bad value.

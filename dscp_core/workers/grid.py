@@ -26,6 +26,7 @@ Item: TypeAlias = tuple[str | int | float, ...]
 Row: TypeAlias = Mapping[str, Any]
 
 FORMAT = "dscp-grid-2"
+_MOST_NAMED = 5
 _CHECKSUM = re.compile(rb'(.*),"crc32":"([0-9a-f]{8})"}', re.DOTALL)
 
 
@@ -151,9 +152,14 @@ class _GridFile:
         names = sorted({*self._identity, *found})
         differing = [name for name in names if found.get(name) != self._identity.get(name)]
         if differing:
+            named = [
+                f"{name} {found.get(name)!r} there, {self._identity.get(name)!r} here"
+                for name in differing[:_MOST_NAMED]
+            ]
+            more = len(differing) - len(named)
             raise GridFileError(
-                f"{self._path} holds other results ({', '.join(differing)} differ): "
-                "choose another folder, or --restart"
+                f"{self._path} holds results of another setup ({'; '.join(named)}"
+                f"{f'; and {more} more' if more else ''}): choose another folder, or --restart"
             )
 
 

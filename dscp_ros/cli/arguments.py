@@ -14,19 +14,21 @@ from dscp_ros.cli.results import print_document
 
 if TYPE_CHECKING:
     from dscp_core.planning.planner import Planner
+    from dscp_core.planning.settings import PlannerSettings
     from dscp_core.problem.declaration import OptimalControlProblem
-    from dscp_core.problem.parameters import Parameter, Value
+    from dscp_core.problem.parameters import Parameter, ParameterTable, Value
     from dscp_core.scp.scp import ScpOptions
 
 # Beyond this, memory and time grow without a visible gain in accuracy.
 MOST_INTERVALS = 2000
 
 
-def add_case_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declares the options that describe a case."""
+def add_case_arguments(parser: argparse.ArgumentParser, *, optional: bool = False) -> None:
+    """Declares the options that describe a case; the problem may be optional."""
     parser.add_argument(
         "problem",
         metavar="PROBLEM",
+        nargs="?" if optional else None,
         help="what to solve: a known name, or FILE.py:NAME for a problem, or a function that "
         "returns one, in a Python file, which is run",
     )
@@ -98,8 +100,12 @@ def overrides(
     return {**read(args.vehicle), **assigned}
 
 
-def parse_assignments(assignments: Sequence[str]) -> dict[str, Value]:
+def parse_assignments(assignments: Sequence[str], option: str = "--set") -> dict[str, Value]:
     """Values of NAME=VALUE texts; names and bounds are checked where the values are used.
+
+    Args:
+        assignments: The texts.
+        option: Where they were given.
 
     Raises:
         InvalidInputError: No NAME=VALUE, a value that is no number, or a name given twice.
@@ -108,9 +114,9 @@ def parse_assignments(assignments: Sequence[str]) -> dict[str, Value]:
     for assignment in assignments:
         name, equals, text = (part.strip() for part in assignment.partition("="))
         if not (name and equals and text):
-            raise InvalidInputError("--set", assignment, "NAME=VALUE")
+            raise InvalidInputError(option, assignment, "NAME=VALUE")
         if name in values:
-            raise InvalidInputError("--set", assignment, f"{name} only once")
+            raise InvalidInputError(option, assignment, f"{name} only once")
         try:
             numbers = [float(part) for part in text.split(",")]
         except ValueError:
@@ -132,10 +138,24 @@ def case_planner(
     Raises:
         InvalidInputError: A value that cannot be used.
     """
+    from dscp_core.planning.planner import Planner
+
+    return Planner(*case_settings(args, options))
+
+
+def case_settings(
+    args: argparse.Namespace, options: ScpOptions
+) -> tuple[OptimalControlProblem, PlannerSettings]:
+    """Problem of the case, and how to plan it; see `case_planner`.
+
+    Raises:
+        InvalidInputError: A value that cannot be used.
+    """
     from dataclasses import replace
 
     from dscp_core import problems
-    from dscp_core.planning.planner import Planner, PlannerSettings, TerminalTime
+    from dscp_core.planning.plan import TerminalTime
+    from dscp_core.planning.settings import PlannerSettings
 
     problem = problems.get(args.problem, args.formulation)
     intervals = problem.default_intervals if args.intervals is None else args.intervals
@@ -155,11 +175,17 @@ def case_planner(
         discretisation=args.discretisation,
         options=options,
     )
-    return Planner(problem, settings)
+    return problem, settings
 
 
-def print_parameters(args: argparse.Namespace) -> None:
+def print_parameters(
+    args: argparse.Namespace, options: Mapping[str, ParameterTable] | None = None
+) -> None:
     """Prints the parameters of the case.
+
+    Args:
+        args: Parsed arguments.
+        options: What else can be set, by the name of the command's option.
 
     Raises:
         InvalidInputError: Unknown problem or formulation, or a bad value.
@@ -167,19 +193,27 @@ def print_parameters(args: argparse.Namespace) -> None:
     from dscp_core import problems
 
     problem = problems.get(args.problem, args.formulation)
-    declared = problem.table
     changed = overrides(args, problem)
-    of_case = declared.with_defaults(changed)
+    tables = {"set": problem.table.with_defaults(changed), **(options or {})}
     if args.json:
-        parameters = [_described(declared[p.name], p.default) for p in of_case.parameters]
-        print_json({"problem": args.problem, "parameters": parameters})
+        parameters = [
+            _described(problem.table[p.name], p.default) for p in tables.pop("set").parameters
+        ]
+        further = {
+            option: [_described(p, p.default) for p in table.parameters]
+            for option, table in tables.items()
+        }
+        print_json({"problem": args.problem, "parameters": parameters, **further})
         return
-    rows = [
-        (p.name, _text(p.default), p.unit, f"[{p.lower:g}, {p.upper:g}]", p.description)
-        for p in of_case.parameters
-    ]
-    value = "value" if changed else "default"
-    print_table(("name", value, "unit", "bounds", "description"), rows)
+    for option, table in tables.items():
+        if option != "set":
+            print(f"\n--{option}:")
+        rows = [
+            (p.name, _text(p.default), p.unit, f"[{p.lower:g}, {p.upper:g}]", p.description)
+            for p in table.parameters
+        ]
+        value = "value" if changed else "default"
+        print_table(("name", value, "unit", "bounds", "description"), rows)
 
 
 def print_table(header: Sequence[str], rows: Sequence[Sequence[str]], indent: str = "") -> None:

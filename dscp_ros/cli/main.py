@@ -27,6 +27,7 @@ class Command(NamedTuple):
 COMMANDS: dict[str, Command] = {
     "plan": Command("dscp_ros.cli.plan_command", "solve one case, without ROS"),
     "gradient": Command("dscp_ros.cli.gradient_command", "differentiate a plan, without ROS"),
+    "simulate": Command("dscp_ros.cli.simulate_command", "fly closed-loop campaigns, without ROS"),
     "study": Command("dscp_ros.cli.study_commands", "reproduce a published result"),
     "train": Command("dscp_ros.cli.train_command", "train the terminal-time network"),
     "tune": Command("dscp_ros.cli.tune_command", "tune parameters on logs"),
@@ -41,6 +42,7 @@ examples:
   dscp plan powered_descent
   dscp plan powered_descent --set terminal_time=32.81 --set initial_position=5000,500,500
   dscp gradient powered_descent --of final_mass --wrt terminal_time --check
+  dscp simulate --flights 20
   dscp planner &
   dscp replay BAG
 

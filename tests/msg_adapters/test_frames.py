@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 from dscp_core import problems
 from dscp_core.errors import InvalidInputError
 from dscp_core.problem.messages import Odometry
+from dscp_core.problem.scene import quaternion_from_z_axis
 from dscp_core.problems.powered_descent.messages import message_from_core
-from dscp_core.problems.powered_descent.scene import quaternion_from_z_axis
 from msg_adapters.errors import InputCode, RejectedInputError
 from msg_adapters.frames import rotate, unit_quaternion
 from msg_adapters.layout import StateLayout, problem_layout

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dscp_core.errors import InvalidInputError
-from dscp_core.problem.scene import Arrows, Line, Scene, Triangles
+from dscp_core.problem.scene import Arrows, Line, Scene, Triangles, quaternion_from_z_axis
 from dscp_core.problems.powered_descent.messages import message_from_core
 
 if TYPE_CHECKING:
@@ -77,25 +77,6 @@ def descent_scene(plan: Plan, style: DescentStyle) -> Scene:
         shapes.append(_cone(style.apex_m, style.glideslope_angle_rad, positions))
     attitudes = np.array([quaternion_from_z_axis(thrust) for thrust in thrusts])
     return Scene(positions, attitudes, tuple(shapes))
-
-
-def quaternion_from_z_axis(direction: Array) -> Array:
-    """Shortest rotation that takes +z to ``direction``, as (x, y, z, w).
-
-    A zero direction gives the identity. Straight down is a half turn about x.
-    """
-    norm = math.hypot(*direction)
-    if norm == 0.0:
-        return np.array([0.0, 0.0, 0.0, 1.0])
-    x, y, z = (float(component) / norm for component in direction)
-    # Half-angle form: (1 + cos) = 2 cos^2(angle / 2); it vanishes only for straight down.
-    scalar = math.sqrt(max(0.0, (1.0 + z) / 2.0))
-    # Below, sin(angle/2) * axis = (-y, x, 0) / (2 scalar), which is 0/0 for straight down.
-    if scalar < 1e-9:
-        return np.array([1.0, 0.0, 0.0, 0.0])
-    quaternion = np.array([-y / (2.0 * scalar), x / (2.0 * scalar), 0.0, scalar])
-    unit: Array = quaternion / np.linalg.norm(quaternion)
-    return unit
 
 
 def _positions_and_thrusts(plan: Plan) -> tuple[Array, Array]:

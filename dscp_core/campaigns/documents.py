@@ -1,0 +1,95 @@
+"""A campaign as plain data: one JSON document, and one table row per flight."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict
+from typing import Any
+
+from dscp_core.campaigns.statistics import (
+    CONFIDENCE,
+    CampaignStatistics,
+    FigureStatistics,
+    judge,
+)
+from dscp_core.problem.declaration import OptimalControlProblem
+from dscp_core.problem.simulation import FlightRecord, FlightSummary, Simulation
+
+
+def document(simulation: Simulation, statistics: CampaignStatistics) -> dict[str, Any]:
+    """The statistics with the setup that they are of, as JSON."""
+    footprint = statistics.footprint
+    return {
+        "settings": simulation.settings,
+        "confidence": CONFIDENCE,
+        "flights": statistics.flights,
+        "successes": statistics.successes,
+        "success": asdict(statistics.success),
+        "figures": {f.figure.name: _figure(f) for f in statistics.figures},
+        "classes": statistics.classes,
+        "failed": [asdict(flight) for flight in statistics.failed],
+        "footprint": None
+        if footprint is None
+        else {
+            "figures": footprint.names,
+            "count": footprint.count,
+            "centre_m": footprint.centre_m.tolist(),
+            "covariance_m2": footprint.covariance_m2.tolist(),
+            "inside_1_2_3_sigma": footprint.inside,
+        },
+    }
+
+
+def _figure(statistics: FigureStatistics) -> dict[str, Any]:
+    numbers = asdict(statistics)
+    figure = numbers.pop("figure")
+    return {
+        "unit": figure["unit"],
+        "description": figure["description"],
+        "bound": figure["most"] if statistics.figure.judged else None,
+        **numbers,
+    }
+
+
+def flight_columns(simulation: Simulation) -> tuple[str, ...]:
+    """Header of a table of flights."""
+    figures = tuple(figure.name for figure in simulation.figures)
+    return ("seed", "success", "classes", *figures, "story")
+
+
+def flight_row(simulation: Simulation, flight: FlightSummary) -> Sequence[object]:
+    """One flight of that table; None where it does not have a figure."""
+    failed = judge(simulation.figures, flight)
+    classes = "; ".join(failed.classes) if failed else ""
+    figures = (flight.figures.get(figure.name) for figure in simulation.figures)
+    return (flight.seed, failed is None, classes, *figures, flight.story)
+
+
+def flight_document(
+    problem: OptimalControlProblem, simulation: Simulation, record: FlightRecord
+) -> dict[str, Any]:
+    """One flight in full, as JSON."""
+    summary = record.summary
+    failed = judge(simulation.figures, summary)
+    return {
+        "problem": problem.name,
+        "settings": simulation.settings,
+        "seed": summary.seed,
+        "success": failed is None,
+        "classes": failed.classes if failed else (),
+        "figures": dict(summary.figures),
+        "bounds": {figure.name: figure.most for figure in simulation.figures if figure.judged},
+        "story": summary.story,
+        "events": record.events,
+        "columns": {
+            "states": [state.name for state in problem.states],
+            "controls": [control.name for control in problem.controls],
+        },
+        "times_s": record.times_s.tolist(),
+        **{
+            name: getattr(record, name).tolist()
+            for name in ("states", "measured", "commanded", "controls")
+        },
+        "phases": record.phases,
+        "histories": {name: values.tolist() for name, values in record.histories.items()},
+    }

@@ -1,0 +1,1 @@
+"""Closed-loop flights in ROS: their logs."""
