@@ -39,6 +39,7 @@ class CartSimulated:
         Parameter("grip", 1.0, "1", "Of the wheels; none, and nothing moves.", lower=0.0),
     )
     guidance = (Parameter("gain", 0.5, "1/s", "Of the speed.", lower=0.0, upper=2.0),)
+    bounds = ()
 
     def __call__(self, planner: Planner, options: Mapping[str, Any]) -> Simulation:
         """A simulation, see `Simulated`."""

@@ -58,7 +58,7 @@ exit codes: 0 every flight was flown (whether it succeeded or not), 2 bad input,
 """
 
 FLIGHTS_FILE = "flights.jsonl"
-OPTIONS = ("truth", "guidance")
+OPTIONS = ("truth", "guidance", "bounds")
 """What a simulation has options of."""
 
 
@@ -85,7 +85,9 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     group.add_argument(
         "--dispersions", type=float, metavar="FACTOR", help="on all random errors (default 1)"
     )
-    for option, what in (("truth", "the world that flies"), ("guidance", "guidance")):
+    for option, what in zip(
+        OPTIONS, ("the world that flies", "guidance", "what a success is"), strict=True
+    ):
         group.add_argument(
             f"--{option}",
             action="append",
@@ -176,12 +178,9 @@ def make_campaign(args: argparse.Namespace) -> Campaign:
 def replay_command(args: argparse.Namespace, seed: int) -> str:
     """The command that flies one flight again."""
     words = ["dscp", "simulate", args.problem]
-    for option, values in (
-        ("--set", args.assignments),
-        ("--truth", args.truth),
-        ("--guidance", args.guidance),
-    ):
-        words += [word for value in values for word in (option, value)]
+    given = {"set": args.assignments, **{option: getattr(args, option) for option in OPTIONS}}
+    for option, values in given.items():
+        words += [word for value in values for word in (f"--{option}", value)]
     for option in ("vehicle", "formulation", "intervals", "solver", "dispersions"):
         if getattr(args, option) is not None:
             words += [f"--{option}", str(getattr(args, option))]

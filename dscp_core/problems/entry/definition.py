@@ -43,6 +43,7 @@ from dscp_core.problems.entry.physics import (
     load_factor,
 )
 from dscp_core.problems.entry.scene import scene_of_settings
+from dscp_core.problems.entry.simulation import EntrySimulated
 from dscp_core.problems.loading import ProblemFamily
 
 NAME = "entry"
@@ -336,7 +337,12 @@ def entry(formulation: Formulation = Formulation.QUADRATIC) -> OptimalControlPro
         ),
         control_states=(ALPHA, BANK),
         formulation=Formulation.QUADRATIC.value,
-        extras=Extras(figure=entry_figure, messages=MESSAGES, scene=scene_of_settings),
+        extras=Extras(
+            figure=entry_figure,
+            messages=MESSAGES,
+            scene=scene_of_settings,
+            simulation=EntrySimulated(),
+        ),
     )
     if formulation is Formulation.QUADRATIC:
         return _weighted(quadratic, *_PROXIMAL_WEIGHTS)
