@@ -30,8 +30,8 @@ from std_msgs.msg import String
 from dscp_core import problems
 from dscp_core.planning.plan import PlanStatus
 from dscp_core.planning.planner import Planner, TerminalTime
-from dscp_core.problems.powered_descent.messages import LANDING_FRAME, message_from_core
 from dscp_core.problem.scene import quaternion_from_z_axis
+from dscp_core.problems.powered_descent.messages import LANDING_FRAME, message_from_core
 from dscp_core.problems.powered_descent.simulation import (
     DescentRecord,
     DescentSimulation,

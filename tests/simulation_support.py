@@ -101,7 +101,9 @@ class CartSimulation:
         states = np.column_stack([east * times / 2.0, speed * np.ones(TICKS)])
         pushes = np.sin(times)[:, np.newaxis]
         return FlightRecord(
-            FlightSummary(seed, figures, "never stopped" if lost else "", f"rolled {east:.1f} m"),
+            FlightSummary(
+                seed, figures, "never stopped" if lost else "", story=f"rolled {east:.1f} m"
+            ),
             times,
             states,
             states + 0.01,

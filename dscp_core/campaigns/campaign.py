@@ -160,7 +160,7 @@ def fly(simulation: Simulation, seed: int) -> FlightSummary:
         return finite(simulation.fly(seed))
     except Exception as error:  # noqa: BLE001 - one flight of thousands; named with its seed
         text = " ".join(f"{type(error).__name__}: {error}".split())
-        return FlightSummary(seed, {}, ERROR, text)
+        return FlightSummary(seed, {}, ERROR, story=text)
 
 
 def finite(summary: FlightSummary) -> FlightSummary:
@@ -169,4 +169,4 @@ def finite(summary: FlightSummary) -> FlightSummary:
     wrong = [f"{n} is {v}" for n, v in summary.figures.items() if n not in numbers]
     if not wrong:
         return replace(summary, figures=numbers)
-    return FlightSummary(summary.seed, numbers, ERROR, "; ".join([*wrong, summary.story]))
+    return FlightSummary(summary.seed, numbers, ERROR, story="; ".join([*wrong, summary.story]))

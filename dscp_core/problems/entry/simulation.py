@@ -271,7 +271,9 @@ class EntrySimulation:
             worst = np.max(flight.loads, axis=0)
             figures |= {f"{n}_ratio": float(v) for n, v in zip(LIMITED, worst, strict=True)}
         if flight.ending != ARRIVED:
-            return FlightSummary(seed, figures, flight.ending, f"after {flight.times[-1]:.0f} s")
+            return FlightSummary(
+                seed, figures, flight.ending, story=f"after {flight.times[-1]:.0f} s"
+            )
         _, across_m = self._target.offset_m(end)
         altitude_m = float(end[RADIUS]) - self._target.radius_m
         turned = float(end[HEADING]) - float(values["final_heading"])
@@ -291,7 +293,7 @@ class EntrySimulation:
             f"{'above' if altitude_m > 0.0 else 'below'} the target after "
             f"{flight.times[-1]:.0f} s, at {end[SPEED]:.0f} m/s"
         )
-        return FlightSummary(seed, figures, "", story)
+        return FlightSummary(seed, figures, story=story)
 
 
 @dataclass

@@ -139,9 +139,22 @@ class DescentSimulation:
             controls=np.array(flight.thrusts),
             phases=tuple(flight.phases),
             events=tuple(flight.events),
+            histories=self._histories(np.array(flight.states), np.array(flight.thrusts)),
             replans=tuple(flight.replans),
             errors=flight.world.errors,
         )
+
+    def _histories(self, states: Array, thrusts: Array) -> dict[str, Array]:
+        """What a figure of a flight shows."""
+        lateral = np.linalg.norm(thrusts[:, 1:], axis=1)
+        return {
+            "altitude_m": states[:, 0] - self.values["final_position"][0],
+            "speed_m_s": np.linalg.norm(states[:, _VELOCITY], axis=1),
+            "thrust_kn": np.linalg.norm(thrusts, axis=1) / 1e3,
+            "tilt_deg": np.degrees(np.arctan2(lateral, thrusts[:, 0])),
+            "off_pad_m": np.linalg.norm(states[:, 1:3] - self.values["final_position"][1:], axis=1),
+            "mass_kg": states[:, _MASS],
+        }
 
     def optimum_kg(self, start: Array) -> float | None:
         """Least propellant from a state (7,) to the pad with the nominal vehicle.
@@ -206,13 +219,17 @@ def _figures(bounds: LandingBounds) -> tuple[FlightFigure, ...]:
     speed, position = bounds.contact_speed_most_m_s, bounds.contact_position_most_m
     tilt = bounds.contact_tilt_most_rad
     return (
-        FlightFigure("contact_speed_m_s", "m/s", "speed at contact", speed),
+        FlightFigure("contact_speed_m_s", "m/s", "speed at contact", speed, "hard"),
         FlightFigure("contact_vertical_m_s", "m/s", "descent at contact"),
         FlightFigure("contact_lateral_m_s", "m/s", "lateral speed at contact"),
-        FlightFigure("contact_position_m", "m", "distance from the pad at contact", position),
+        FlightFigure(
+            "contact_position_m", "m", "distance from the pad at contact", position, "off target"
+        ),
         FlightFigure("contact_y_m", "m", "from the pad along y at contact"),
         FlightFigure("contact_z_m", "m", "from the pad along z at contact"),
-        FlightFigure("contact_tilt_rad", "rad", "thrust off the vertical at contact", tilt),
+        FlightFigure(
+            "contact_tilt_rad", "rad", "thrust off the vertical at contact", tilt, "tilted"
+        ),
         FlightFigure("fuel_kg", "kg", "propellant burnt"),
         FlightFigure("fuel_over_optimum", "1", "propellant above the optimum's, relative to it"),
         FlightFigure("excess_hover_s", "s", "the same as time of hover before landing"),
@@ -236,17 +253,28 @@ def _sorted(options: Mapping[str, Any]) -> dict[Any, dict[str, Any]]:
     return chosen
 
 
+def _options(kind: Any) -> tuple[Parameter, ...]:
+    """Options of one kind of settings; NaN stands for what suits the vehicle."""
+    return tuple(replace(p, default=math.nan) if p.name in SUITED else p for p in declared(kind))
+
+
 class DescentSimulations:
     """Makes simulations from options by name."""
 
     @property
-    def options(self) -> tuple[Parameter, ...]:
-        """Those of guidance, truth and bounds; NaN stands for what suits the vehicle."""
-        return tuple(
-            replace(p, default=math.nan) if p.name in SUITED else p
-            for kind in _KINDS
-            for p in declared(kind)
-        )
+    def truth(self) -> tuple[Parameter, ...]:
+        """See `Simulated`."""
+        return _options(TruthSettings)
+
+    @property
+    def guidance(self) -> tuple[Parameter, ...]:
+        """See `Simulated`."""
+        return _options(GuidanceSettings)
+
+    @property
+    def bounds(self) -> tuple[Parameter, ...]:
+        """See `Simulated`."""
+        return _options(LandingBounds)
 
     def __call__(self, planner: Planner, options: Mapping[str, Any]) -> DescentSimulation:
         """See `DescentSimulation`."""

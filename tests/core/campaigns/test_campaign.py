@@ -111,13 +111,15 @@ def test_a_flight_that_raises_is_one_failure(tmp_path: Path) -> None:
     result = flown(tmp_path / "flights.jsonl", 10, raising=5.0)
     failed = {flight.seed: flight for flight in result.flights if flight.failure}
     assert sorted(failed) == [5, 10]
-    assert failed[5] == FlightSummary(5, {}, "error", "ZeroDivisionError: seed 5 has no wheels")
+    assert failed[5] == FlightSummary(
+        5, {}, "error", story="ZeroDivisionError: seed 5 has no wheels"
+    )
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
 def test_a_figure_that_is_no_number_is_a_failure(value: float) -> None:
-    told = finite(FlightSummary(3, {"a": 1.0, "b": value}, "", "rolled"))
-    assert told == FlightSummary(3, {"a": 1.0}, "error", f"b is {value}; rolled")
+    told = finite(FlightSummary(3, {"a": 1.0, "b": value}, "", story="rolled"))
+    assert told == FlightSummary(3, {"a": 1.0}, "error", story=f"b is {value}; rolled")
 
 
 def test_an_interrupt_is_no_failure_of_a_flight() -> None:

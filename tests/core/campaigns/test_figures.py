@@ -11,7 +11,7 @@ from dscp_core.problem.simulation import FlightSummary
 
 SIMULATION = CartSimulation(1.5, VALUES)
 FLIGHTS = [SIMULATION.fly(seed) for seed in range(1, 101)]
-ERROR = FlightSummary(7, {}, "error", "why")
+ERROR = FlightSummary(7, {}, "error", story="why")
 
 
 @pytest.mark.parametrize(

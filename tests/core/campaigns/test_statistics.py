@@ -96,7 +96,7 @@ def test_judgement(
     changes: dict[str, float | None], failure: str, classes: tuple[str, ...] | None
 ) -> None:
     figures = {n: v for n, v in {**GOOD, **changes}.items() if v is not None}
-    failed = judge(FIGURES, FlightSummary(4, figures, failure, "rolled"))
+    failed = judge(FIGURES, FlightSummary(4, figures, failure, story="rolled"))
     assert (failed and failed.classes) == classes
     if failed:
         over = {n: v for n, v in changes.items() if v is not None and n != "energy_j"}
@@ -112,7 +112,7 @@ def test_a_bound_without_a_word_is_named_by_its_number() -> None:
 
 def test_sums() -> None:
     flights = [SIMULATION.fly(seed) for seed in range(1, 101)]
-    flights[3] = FlightSummary(4, {}, "error", "why")
+    flights[3] = FlightSummary(4, {}, "error", story="why")
     summed = statistics(SIMULATION, flights)
     assert repr(statistics(SIMULATION, flights[::-1])) == repr(summed), "in any order"
     speeds = np.array(

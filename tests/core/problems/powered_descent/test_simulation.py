@@ -20,6 +20,7 @@ from dscp_core.problems.powered_descent.simulation import (
 
 PROBLEM = problems.get("powered_descent")
 SIMULATED = PROBLEM.extras.simulation
+OPTIONS = (*SIMULATED.truth, *SIMULATED.guidance, *SIMULATED.bounds)
 # The landing burn of one engine: 4 m/s^2 of braking with the least thrust.
 NO_HOVER = {
     "initial_mass": 29500.0,
@@ -115,7 +116,7 @@ def test_settings_tell_everything(usual: DescentSimulation) -> None:
     assert told["truth"]["wind_m_s2"] == 0.1
     assert told["vehicle"]["thrust_max"] == 845.2e3
     assert set(told["guidance"]) | set(told["truth"]) | set(told["bounds"]) == {
-        option.name for option in SIMULATED.options
+        option.name for option in OPTIONS
     }
 
 
@@ -165,9 +166,9 @@ def test_nothing_to_fly_is_told_at_once() -> None:
 
 
 def test_options_are_known_by_name() -> None:
-    names = [option.name for option in SIMULATED.options]
+    names = [option.name for option in OPTIONS]
     assert len(set(names)) == len(names)
-    assert all(option.description and option.unit for option in SIMULATED.options)
+    assert all(option.description and option.unit for option in OPTIONS)
     with pytest.raises(InvalidInputError, match="replan_s"):
         SIMULATED(planner(), {"replan": 1.0})
     with pytest.raises(InvalidInputError, match="wind_m_s2"):
