@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import time
 from collections.abc import Mapping
@@ -66,7 +67,7 @@ class CartSimulation:
         """All but what no figure depends on."""
         names = ("dispersion", "raising", "grip")
         return {
-            "vehicle": {"mass": self.mass_kg},
+            "vehicle": {"mass": self.mass_kg, "range_max": [math.inf, 1.0]},
             "truth": {name: self.values[name] for name in names},
             "guidance": {"gain": self.values["gain"]},
         }

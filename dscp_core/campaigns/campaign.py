@@ -10,6 +10,7 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from dscp_core.campaigns.documents import settings_document
 from dscp_core.campaigns.statistics import ERROR
 from dscp_core.errors import InvalidInputError
 from dscp_core.planning.planner import Planner, PlannerSettings
@@ -136,7 +137,7 @@ def identity(campaign: Campaign, simulation: Simulation) -> dict[str, Any]:
     """All that decides a flight beside its seed, flat: nested names are joined by dots."""
     problem = campaign.problem
     flat: dict[str, Any] = {"problem": problem.name, "formulation": problem.formulation}
-    _flatten(flat, "", simulation.settings)
+    _flatten(flat, "", settings_document(simulation.settings))
     return {**flat, "code": code_version()}
 
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
@@ -16,11 +17,22 @@ from dscp_core.problem.declaration import OptimalControlProblem
 from dscp_core.problem.simulation import FlightRecord, FlightSummary, Simulation
 
 
+def settings_document(settings: Any) -> Any:
+    """Nested settings as JSON; what is infinite or no number, as text."""
+    if isinstance(settings, Mapping):
+        return {str(name): settings_document(value) for name, value in settings.items()}
+    if isinstance(settings, list | tuple):
+        return [settings_document(value) for value in settings]
+    if isinstance(settings, float) and not math.isfinite(settings):
+        return str(settings)
+    return settings
+
+
 def document(simulation: Simulation, statistics: CampaignStatistics) -> dict[str, Any]:
     """The statistics with the setup that they are of, as JSON."""
     footprint = statistics.footprint
     return {
-        "settings": simulation.settings,
+        "settings": settings_document(simulation.settings),
         "confidence": CONFIDENCE,
         "flights": statistics.flights,
         "successes": statistics.successes,
@@ -73,7 +85,7 @@ def flight_document(
     failed = judge(simulation.figures, summary)
     return {
         "problem": problem.name,
-        "settings": simulation.settings,
+        "settings": settings_document(simulation.settings),
         "seed": summary.seed,
         "success": failed is None,
         "classes": failed.classes if failed else (),

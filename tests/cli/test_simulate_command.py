@@ -48,7 +48,7 @@ def test_what_it_prints_and_writes(tmp_path: Path, capsys: pytest.CaptureFixture
 
     written = read(tmp_path / "statistics.json")
     assert (written["flights"], written["successes"], written["seeds"]) == (30, 29, [1, 30])
-    assert written["settings"]["vehicle"] == {"mass": 2.0}
+    assert written["settings"]["vehicle"] == {"mass": 2.0, "range_max": ["inf", 1.0]}
     assert written["classes"] == {"error": 1}
     assert written["failed"][0]["seed"] == 25
     speeds = written["figures"]["stop_speed_m_s"]
