@@ -6,10 +6,9 @@ The same numbers come out each time; README.md tells what they are.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from bag_parts import (
@@ -21,56 +20,32 @@ from bag_parts import (
     shuffle_names,
     write_bags,
 )
-from geometry_msgs.msg import InertiaStamped
-from nav_msgs.msg import Odometry
-from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 
 from dscp_core import problems
 from dscp_core.planning.plan import PlanStatus
 from dscp_core.planning.planner import Planner, TerminalTime
-from dscp_core.problem.scene import quaternion_from_z_axis
-from dscp_core.problems.powered_descent.messages import LANDING_FRAME, message_from_core
-from dscp_core.problems.powered_descent.simulation import (
-    DescentRecord,
-    DescentSimulation,
-    Replan,
-)
+from dscp_core.problems.powered_descent.simulation import DescentSimulation
 from dscp_ros.bag import BagWriter
+from dscp_ros.flights.logs import LEAD_S, STATE_LATENCY_S, write_flight
 from msg_adapters.errors import InputCode
-from msg_adapters.frames import Array
 from msg_adapters.joint_state import joint_state_from_state
 from msg_adapters.layout import StateLayout, problem_layout
-from msg_adapters.mass import inertia_from_mass
-from msg_adapters.odometry import odometry_from_kinematics
 from msg_adapters.stamps import (
     nanoseconds_from_seconds,
     stamp_from_nanoseconds,
 )
-from msg_adapters.state import Kinematics, StampedMass, StampedState
+from msg_adapters.state import StampedState
 
 NOMINAL, DISPERSED = "powered_descent_nominal", "powered_descent_dispersed"
 IGNITIONS_LOG, IGNITIONS_UNSEEN = "ignitions_log", "ignitions_unseen"
-
-STATE_TOPIC = "/planner/state"
-MASS_TOPIC = "/planner/mass"
 
 DISPERSED_START_NS = nanoseconds_from_seconds(datetime(2026, 3, 2, 9, 0, tzinfo=UTC).timestamp())
 NOMINAL_START_NS = nanoseconds_from_seconds(datetime(2026, 3, 2, 9, 10, tzinfo=UTC).timestamp())
 """Later than the other bag, so that the clock moves forward when both are replayed in turn."""
 
-LEAD_S = 1.0
-"""Story before the first state: time for subscribers to find /clock."""
-EARLY_MASS_S = 0.5
-"""From a first mass to the first state; the engine is off until then."""
-MASS_LATENCY_S, STATE_LATENCY_S = 0.010, 0.015
-"""From stamp to log time: what sensors and transport take."""
-
 NOMINAL_SEED = 1
-HEADING_RAD = math.radians(40.0)
-"""Roll about the vertical, so that body and landing axes differ by more than the small tilt."""
-
 DISPERSED_SEED = 7
 DISPERSED_STATES = 40
 DISPERSED_PERIOD_S = 0.3
@@ -87,83 +62,11 @@ IGNITIONS_PERIOD_S = 0.2
 
 def write_nominal(folder: Path) -> Path:
     """Writes one closed-loop descent; returns the bag."""
-    planner = Planner(problems.get("powered_descent"), terminal_time=TerminalTime.FREE)
-    simulation = DescentSimulation(planner)
-    record = simulation.record(NOMINAL_SEED)
-    bag = folder / NOMINAL
-    with BagWriter(bag, overwrite=True) as writer:
-        writer.add_topic(STORY_TOPIC, String, RELIABLE)
-        writer.add_topic(MASS_TOPIC, InertiaStamped, RELIABLE)
-        writer.add_topic(STATE_TOPIC, Odometry, RELIABLE)
-        for entry in sorted(_nominal_entries(record, simulation.truth.delay_s), key=_time):
-            writer.write(entry.topic, entry.message, entry.time_ns)
-    return bag
-
-
-class _Entry(NamedTuple):
-    time_ns: int
-    topic: str
-    message: String | InertiaStamped | Odometry
-
-
-def _time(entry: _Entry) -> int:
-    return entry.time_ns
-
-
-def _nominal_entries(record: DescentRecord, delay_s: float) -> Iterable[_Entry]:
-    """Everything in the bag, in no order; measurements are stamped when they were true."""
-
-    def at(time_s: float) -> int:
-        return NOMINAL_START_NS + nanoseconds_from_seconds(time_s)
-
-    lit = np.linalg.norm(record.commanded, axis=1) > 0.0
-    on_s = record.times_s[np.argmax(lit)]
-    seed = record.summary.seed
-    opening = f"closed-loop powered descent, simulation seed {seed}; engine on at {on_s:g} s"
-    yield _Entry(at(-LEAD_S), STORY_TOPIC, String(data=opening))
-    for replan in record.replans:
-        time_s = record.times_s[replan.tick]
-        yield _Entry(at(time_s), STORY_TOPIC, String(data=_replan_text(time_s, replan)))
-    yield _Entry(at(record.times_s[-1]), STORY_TOPIC, String(data=_end_text(record)))
-    # Topics may overtake each other: without this, the first state can come before its mass.
-    before_ns = at(-EARLY_MASS_S)
-    mass = inertia_from_mass(StampedMass(before_ns, float(record.measured[0, 6])))
-    yield _Entry(before_ns, MASS_TOPIC, mass)
-    # Until the engine is lit, the vehicle points where it will burn.
-    commanded = np.where(lit[:, np.newaxis], record.commanded, record.commanded[np.argmax(lit)])
-    for time_s, measured, thrust in zip(record.times_s, record.measured, commanded, strict=True):
-        stamp_ns = at(time_s - delay_s)
-        mass = inertia_from_mass(StampedMass(stamp_ns, float(measured[6])))
-        yield _Entry(at(time_s + MASS_LATENCY_S), MASS_TOPIC, mass)
-        kinematics = Kinematics(
-            stamp_ns, message_from_core(measured[0:3]), message_from_core(measured[3:6])
-        )
-        odometry = odometry_from_kinematics(
-            kinematics, frame=LANDING_FRAME, attitude=_attitude(thrust)
-        )
-        yield _Entry(at(time_s + STATE_LATENCY_S), STATE_TOPIC, odometry)
-
-
-def _attitude(thrust: Array) -> Array:
-    """Quaternion (x, y, z, w) of a body whose +z axis points along the thrust (core axes)."""
-    tilt = Rotation.from_quat(quaternion_from_z_axis(message_from_core(thrust)))
-    heading = Rotation.from_rotvec([0.0, 0.0, HEADING_RAD])
-    return np.asarray((tilt * heading).as_quat())
-
-
-def _replan_text(time_s: float, replan: Replan) -> str:
-    outcome = replan.outcome
-    if outcome is None:
-        return f"{time_s:.1f} s: onboard guidance got no answer from its planner"
-    return (
-        f"{time_s:.1f} s: onboard guidance {outcome.status.name}, "
-        f"{outcome.terminal_time_used_s:.2f} s to go, "
-        f"thrust limit {replan.thrust_max_n / 1e3:.0f} kN"
+    problem = problems.get("powered_descent")
+    simulation = DescentSimulation(Planner(problem, terminal_time=TerminalTime.FREE))
+    return write_flight(
+        folder / NOMINAL, problem, simulation.record(NOMINAL_SEED), NOMINAL_START_NS
     )
-
-
-def _end_text(record: DescentRecord) -> str:
-    return f"{record.summary.story}, {record.states[-1, 6]:.0f} kg left"
 
 
 def _set_frame(frame: str) -> Callable[[JointState], None]:

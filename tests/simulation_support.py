@@ -108,6 +108,7 @@ class CartSimulation:
             times,
             states,
             states + 0.01,
+            times - 0.05,
             pushes,
             self.values["grip"] * pushes,
             tuple("roll" for _ in times),

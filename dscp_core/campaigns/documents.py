@@ -77,6 +77,9 @@ def flight_row(simulation: Simulation, flight: FlightSummary) -> Sequence[object
     return (flight.seed, failed is None, classes, *figures, flight.story)
 
 
+_ARRAYS = ("times_s", "states", "measured", "measured_at_s", "commanded", "controls")
+
+
 def flight_document(
     problem: OptimalControlProblem, simulation: Simulation, record: FlightRecord
 ) -> dict[str, Any]:
@@ -97,11 +100,7 @@ def flight_document(
             "states": [state.name for state in problem.states],
             "controls": [control.name for control in problem.controls],
         },
-        "times_s": record.times_s.tolist(),
-        **{
-            name: getattr(record, name).tolist()
-            for name in ("states", "measured", "commanded", "controls")
-        },
+        **{name: getattr(record, name).tolist() for name in _ARRAYS},
         "phases": record.phases,
         "histories": {name: values.tolist() for name, values in record.histories.items()},
     }

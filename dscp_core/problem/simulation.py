@@ -89,6 +89,7 @@ class FlightRecord:
         times_s: (M,) from the start.
         states: (M, nx) true states, SI, in the problem's order.
         measured: (M, nx) what navigation told then.
+        measured_at_s: (M,) when that was true.
         commanded: (M, nu) from each tick on; the last row repeats the one before it.
         controls: (M, nu) what the actuators were doing at that time.
         phases: (M,) of guidance.
@@ -100,6 +101,7 @@ class FlightRecord:
     times_s: Array
     states: Array
     measured: Array
+    measured_at_s: Array
     commanded: Array
     controls: Array
     phases: tuple[str, ...]

@@ -52,8 +52,8 @@ def write_flight(
     """Write one flight; a bag that is there is replaced.
 
     A problem whose states are a position, a velocity and a mass is told by odometry, with the
-    body's +z axis along the commanded thrust, and by the mass; any other by named scalars. Every
-    message is stamped when navigation tells it, however old what it tells is.
+    body's +z axis along the commanded thrust, and by the mass; any other by named scalars. Messages
+    are stamped when what they tell was true, and logged when navigation tells it.
 
     Args:
         bag: Path of the bag.
@@ -92,33 +92,37 @@ def _story(record: FlightRecord, start_ns: int) -> Iterator[_Entry]:
 
 
 def _states(layout: StateLayout, record: FlightRecord, start_ns: int) -> Iterator[_Entry]:
-    for number, (time_s, measured) in enumerate(zip(record.times_s, record.measured, strict=True)):
-        stamp_ns = start_ns + nanoseconds_from_seconds(float(time_s))
-        log_ns = stamp_ns + nanoseconds_from_seconds(STATE_LATENCY_S)
+    lit = np.linalg.norm(record.commanded, axis=1) > 0.0
+    # Until the engine is lit, the vehicle points where it will burn.
+    commanded = np.where(lit[:, np.newaxis], record.commanded, record.commanded[np.argmax(lit)])
+    for number, measured in enumerate(record.measured):
+        told_ns, stamp_ns = (
+            start_ns + nanoseconds_from_seconds(float(times[number]))
+            for times in (record.times_s, record.measured_at_s)
+        )
+        log_ns = told_ns + nanoseconds_from_seconds(STATE_LATENCY_S)
         if layout.odometry is None:
             message = joint_state_from_state(StampedState(stamp_ns, measured), layout)
             yield _Entry(log_ns, VEHICLE_STATE_TOPIC, message)
             continue
         named = dict(zip(layout.message_names, layout.to_message_order(measured), strict=True))
         if (name := layout.odometry.mass) is not None:
-            yield from _masses(stamp_ns, float(named[name]), first=number == 0)
+            mass_kg = float(named[name])
+            if number == 0:
+                # Topics may overtake each other: without this, the first state can come first.
+                before_ns = start_ns - nanoseconds_from_seconds(EARLY_MASS_S)
+                early = inertia_from_mass(StampedMass(before_ns, mass_kg))
+                yield _Entry(before_ns, MASS_TOPIC, early)
+            mass_ns = told_ns + nanoseconds_from_seconds(MASS_LATENCY_S)
+            yield _Entry(mass_ns, MASS_TOPIC, inertia_from_mass(StampedMass(stamp_ns, mass_kg)))
         position, velocity = (
             _vector(named, names) for names in (layout.odometry.position, layout.odometry.velocity)
         )
-        attitude = _attitude(layout, record.commanded[number])
+        attitude = _attitude(layout, commanded[number])
         odometry = odometry_from_kinematics(
             Kinematics(stamp_ns, position, velocity), frame=layout.frame, attitude=attitude
         )
         yield _Entry(log_ns, STATE_TOPIC, odometry)
-
-
-def _masses(stamp_ns: int, mass_kg: float, *, first: bool) -> Iterator[_Entry]:
-    if first:
-        # Topics may overtake each other: without this, the first state can come before its mass.
-        before_ns = stamp_ns - nanoseconds_from_seconds(EARLY_MASS_S)
-        yield _Entry(before_ns, MASS_TOPIC, inertia_from_mass(StampedMass(before_ns, mass_kg)))
-    log_ns = stamp_ns + nanoseconds_from_seconds(MASS_LATENCY_S)
-    yield _Entry(log_ns, MASS_TOPIC, inertia_from_mass(StampedMass(stamp_ns, mass_kg)))
 
 
 def _vector(named: Mapping[str, float], names: tuple[str, str, str]) -> Array:

@@ -28,7 +28,7 @@ def test_a_flight_of_named_scalars(tmp_path: Path) -> None:
     assert np.array_equal([message.position for message in states], RECORD.measured)
     assert states[0].name == ["position", "speed"]
     stamps = [m.header.stamp.sec * 10**9 + m.header.stamp.nanosec - START_NS for m in states]
-    assert np.allclose(np.array(stamps) / 1e9, RECORD.times_s)
+    assert np.allclose(np.array(stamps) / 1e9, RECORD.measured_at_s)
     story = [message.data for topic, message in found if topic == "/story"]
     assert story == [
         "closed-loop flight, simulation seed 3",

@@ -214,6 +214,7 @@ class EntrySimulation:
             times_s=np.array(flight.times),
             states=states,
             measured=np.array(flight.measured),
+            measured_at_s=np.array(flight.times),
             commanded=commanded,
             controls=commanded,
             phases=tuple("entry" for _ in flight.times),

@@ -135,6 +135,7 @@ class DescentSimulation:
             times_s=np.array(flight.times),
             states=np.array(flight.states),
             measured=np.array(flight.measured),
+            measured_at_s=np.array(flight.times) - self.truth.delay_s,
             commanded=np.array(flight.commanded),
             controls=np.array(flight.thrusts),
             phases=tuple(flight.phases),
