@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from dscp_core.errors import DscpError, InvalidInputError
 from dscp_core.planning.plan import TerminalTime
 from dscp_core.planning.planner import Planner
-from dscp_core.problem.declaration import TERMINAL_TIME
-from dscp_core.problem.options import declared, option, validate
+from dscp_core.problem.options import declared, option, validate, values
 from dscp_core.problem.parameters import Parameter, ParameterTable
 from dscp_core.problem.simulation import FlightFigure, FlightRecord, FlightSummary
 from dscp_core.problems.entry.guidance import EntryGuidance, GuidanceSettings
@@ -187,17 +186,16 @@ class EntrySimulation:
     def settings(self) -> Mapping[str, Any]:
         """See `Simulation`."""
         planner = self._given
-        values = planner.problem.table.unpack(planner.parameters)
         return {
-            "vehicle": {n: np.asarray(v).tolist() for n, v in values.items() if n != TERMINAL_TIME},
+            "vehicle": {n: np.asarray(v).tolist() for n, v in self._values.items()},
             "planner": {
                 "intervals": planner.settings.intervals,
                 "hold": planner.settings.hold.value,
-                "solver": str(planner.settings.options.solver),
+                "solver": planner.settings.options.solver,
             },
-            "guidance": asdict(self.guidance),
-            "truth": asdict(self.truth),
-            "bounds": asdict(self.bounds),
+            "guidance": dict(values(self.guidance)),
+            "truth": dict(values(self.truth)),
+            "bounds": dict(values(self.bounds)),
         }
 
     def fly(self, seed: int) -> FlightSummary:
@@ -230,17 +228,17 @@ class EntrySimulation:
         )
 
     def _fly(self, random: np.random.Generator) -> _Flight:
-        problem, values, tick_s = self.planner.problem, self._values, self.guidance.tick_s
-        errors = draw(self.truth, values, random)
-        truth = true_values(values, errors)
+        problem, assumed, tick_s = self.planner.problem, self._values, self.guidance.tick_s
+        errors = draw(self.truth, assumed, random)
+        truth = true_values(assumed, errors)
         parameters = problem.table.pack(truth)
-        limits = np.array([float(values[f"{name}_max"]) for name in LIMITED])
+        limits = np.array([float(assumed[f"{name}_max"]) for name in LIMITED])
         self.planner.parameters = self._nominal.copy()  # guidance adapts them in flight
         guidance = EntryGuidance(self.planner, self.guidance, self.truth.planning_latency_s)
         flight = _Flight(guidance, [self.planner.initial_state + errors.initial_state])
         while not flight.ending:
             time_s, state = flight.times[-1], flight.states[-1]
-            flight.measured.append(measure(state, self.truth, values, random))
+            flight.measured.append(measure(state, self.truth, assumed, random))
             known = len(guidance.replans)
             flight.commands.append(guidance.command(time_s, flight.measured[-1]))
             flight.events += [(r.time_s, r.outcome.headline) for r in guidance.replans[known:]]
@@ -257,12 +255,12 @@ class EntrySimulation:
             flight.loads.append(loads / limits)
             if not flight.ending and flight.times[-1] > self._longest_s:
                 flight.ending = "never arrived"
-        flight.measured += [measure(flight.states[-1], self.truth, values, random)]
+        flight.measured += [measure(flight.states[-1], self.truth, assumed, random)]
         flight.events.append((flight.times[-1], flight.ending))
         return flight
 
     def _summary(self, flight: _Flight, seed: int) -> FlightSummary:
-        end, values = flight.states[-1], self._values
+        end, assumed = flight.states[-1], self._values
         figures = {
             "flight_s": flight.times[-1],
             "replans": float(len(flight.guidance.replans)),
@@ -277,12 +275,12 @@ class EntrySimulation:
             )
         _, across_m = self._target.offset_m(end)
         altitude_m = float(end[RADIUS]) - self._target.radius_m
-        turned = float(end[HEADING]) - float(values["final_heading"])
+        turned = float(end[HEADING]) - float(assumed["final_heading"])
         figures |= {
             "altitude_error_m": abs(altitude_m),
             "cross_track_error_m": abs(across_m),
             "flight_path_angle_error_rad": abs(
-                float(end[GAMMA]) - float(values["final_flight_path_angle"])
+                float(end[GAMMA]) - float(assumed["final_flight_path_angle"])
             ),
             "heading_error_rad": abs(math.remainder(turned, 2.0 * math.pi)),
             "speed_m_s": float(end[SPEED]),
