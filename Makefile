@@ -43,9 +43,10 @@ format: $(READY) ## format the code, fix what can be fixed
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
 
-demo: $(READY) ## replay descents into the planner node, tune it on a log, reload; results in out/demo
+demo: $(READY) ## replay descents into the planner node, tune, reload; fly a campaign; results in out/demo
 	$(BIN)/python -m dscp_ros.demo --output out/demo
 	$(BIN)/python -m dscp_ros.demo --loop --output out/demo/loop
+	$(BIN)/python -m dscp_ros.demo --campaign --output out/demo/campaign
 
 demo-entry: $(READY) ## the same with a recorded entry; results in out/demo-entry
 	$(BIN)/python -m dscp_ros.demo --problem entry --output out/demo-entry

@@ -30,6 +30,7 @@ PARSED_ONLY = {
     ("planner",): "lives until it is stopped; tests/ros starts it",
     ("replay",): "takes as long as the flight, and wants a listener; tests/ros/test_replay.py",
     ("bag", "record"): "lives until it is stopped; tests/ros/test_bag_record.py",
+    ("simulate",): "many flights; tests/cli/test_simulate_command.py",
     ("study",): "minutes even with --quick; tests/cli/test_study_command.py",
     ("train",): "minutes; tests/cli/test_train_command.py",
     ("evaluate",): "minutes; tests/core/learning",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 import os
+import shlex
 import signal
 import sys
 import time
@@ -19,6 +20,7 @@ from dscp_ros.bag import BagError
 from dscp_ros.cli import ExitCode
 from dscp_ros.cli.output_files import complete_file
 from dscp_ros.demo.cases import (
+    CAMPAIGN_FLIGHTS,
     CASES,
     LOOP_BAGS,
     LOOP_EPOCHS,
@@ -80,6 +82,15 @@ def main(argv: Sequence[str] | None = None) -> int:
         help="plan, tune on the log, reload, and plan from states that the tuning has not seen",
     )
     parser.add_argument(
+        "--campaign",
+        type=int,
+        nargs="?",
+        const=CAMPAIGN_FLIGHTS,
+        metavar="N",
+        help="fly the problem in closed loop instead, without ROS: dscp simulate --flights N "
+        f"({CAMPAIGN_FLIGHTS})",
+    )
+    parser.add_argument(
         "--epochs",
         type=int,
         default=LOOP_EPOCHS,
@@ -110,6 +121,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         _require_positive("--rate", rate)
         _require_positive("--timeout", args.timeout)
+        if args.campaign is not None:
+            return _fly(args.problem, args.campaign, args.output)
         if args.loop:
             return _run_loop(args.output, args.bag, args.epochs, args.rate, args.timeout)
         return _run(case, args.output, args.bag or case.bags(), rate, args.timeout)
@@ -148,6 +161,14 @@ def _make_folder(folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InvalidInputError("--output", str(folder), f"a folder ({error.strerror})") from None
+
+
+def _fly(problem: str, flights: int, folder: Path) -> int:
+    from dscp_ros.cli.main import main as dscp
+
+    command = ["simulate", problem, "--flights", str(flights), "--output", str(folder)]
+    print(shlex.join(["dscp", *command]), flush=True)
+    return dscp([*command, "--restart"])
 
 
 def _run_loop(

@@ -117,3 +117,6 @@ LOOP_BAGS = ("ignitions_log", "ignitions_unseen")
 LOOP_VEHICLE = "config/aged_engine.yaml"
 LOOP_RATE = 1.0
 LOOP_EPOCHS = 6
+
+CAMPAIGN_FLIGHTS = 20
+"""Less than a minute on two cores."""

@@ -302,3 +302,11 @@ def test_the_loop_tunes_on_the_log_and_reloads_what_it_found(tmp_path: Path) -> 
     certified = sum(report["code"] == "0" for report in after)
     assert rows["certified"][1] == str(certified)
     assert rows["planning attempts"][1] == str(len(after))
+
+
+def test_a_small_campaign_shows_its_table_and_figure(tmp_path: Path) -> None:
+    with running(tmp_path, "--campaign", "2") as demo:
+        assert demo.finish() == ExitCode.OK, demo.text
+    assert "dscp simulate powered_descent --flights 2" in demo.text
+    assert "powered_descent: 2 of 2 flights succeeded" in demo.text
+    assert (tmp_path / "campaign.png").read_bytes().startswith(PNG_SIGNATURE)
