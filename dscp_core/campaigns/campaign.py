@@ -18,7 +18,9 @@ from dscp_core.problem.declaration import OptimalControlProblem
 from dscp_core.problem.parameters import Value
 from dscp_core.problem.simulation import FlightSummary, Simulation
 from dscp_core.workers.choice import make_engine
+from dscp_core.workers.engine import Engine
 from dscp_core.workers.grid import Item, Row, code_version, run_grid
+from dscp_core.workers.processes import SerialEngine
 
 MOST_FLIGHTS = 10_000_000
 
@@ -30,7 +32,9 @@ class Campaign:
     Attributes:
         problem: Brings a simulation along.
         settings: Of guidance's planner.
-        options: Of truth and guidance by name, SI.
+        options: Of truth, guidance and bounds by name, SI.
+        planner: One that plans elsewhere, for flights one after the other in this process; None
+            for one of the settings in every worker.
 
     Example:
         >>> from dscp_core.campaigns.campaign import seeds_of
@@ -41,6 +45,7 @@ class Campaign:
     problem: OptimalControlProblem
     settings: PlannerSettings
     options: Mapping[str, Value] = field(default_factory=dict)
+    planner: Planner | None = None
 
     def simulation(self) -> Simulation:
         """Its flights.
@@ -54,7 +59,8 @@ class Campaign:
             raise InvalidInputError(
                 "problem", self.problem.name, "one whose extras bring a simulation"
             )
-        return simulated(Planner(self.problem, self.settings), self.options)
+        planner = self.planner or Planner(self.problem, self.settings)
+        return simulated(planner, self.options)
 
     def __call__(self) -> Callable[[Item], Row]:
         """Compile what flights need."""
@@ -122,13 +128,13 @@ def run_campaign(
     """
     simulation = campaign.simulation()
     setup = identity(campaign, simulation)
-    result = run_grid(
-        path,
-        setup,
-        [(seed,) for seed in seeds],
-        lambda: make_engine(campaign, workers, ray_address),
-        report,
-    )
+
+    def engine() -> Engine[Item, Row]:
+        if campaign.planner is not None:
+            return SerialEngine(campaign)
+        return make_engine(campaign, workers, ray_address)
+
+    result = run_grid(path, setup, [(seed,) for seed in seeds], engine, report)
     flights = tuple(FlightSummary(**row) for row in result.rows)
     return CampaignResult(simulation, flights, result.kept, result.damaged, digest(setup))
 
@@ -137,6 +143,8 @@ def identity(campaign: Campaign, simulation: Simulation) -> dict[str, Any]:
     """All that decides a flight beside its seed, flat: nested names are joined by dots."""
     problem = campaign.problem
     flat: dict[str, Any] = {"problem": problem.name, "formulation": problem.formulation}
+    if campaign.planner is not None:
+        flat["planned_by"] = type(campaign.planner).__name__
     _flatten(flat, "", settings_document(simulation.settings))
     return {**flat, "code": code_version()}
 

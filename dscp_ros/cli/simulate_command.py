@@ -6,7 +6,9 @@ import argparse
 import shlex
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, nullcontext
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -98,6 +100,12 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     group.add_argument(
         "--replay", type=int, metavar="SEED", help="fly one flight again, and write it in full"
     )
+    group.add_argument(
+        "--over-ros",
+        action="store_true",
+        help="let a planner node, a process of its own, make the plans over ROS 2 topics; one "
+        "flight after the other",
+    )
     add_computing(parser)
     add_folder(parser, "out/simulate")
     group = parser.add_argument_group("output")
@@ -135,11 +143,25 @@ def run(args: argparse.Namespace) -> int:
         raise InvalidInputError("--workers", args.workers, ">= 1")
     check_folder(args.output)
     campaign = make_campaign(args)
-    if args.replay is not None:
-        _replay(args, campaign)
-    else:
-        _fly(args, campaign)
+    with _over_ros(args, campaign) if args.over_ros else nullcontext(campaign) as chosen:
+        if args.replay is not None:
+            _replay(args, chosen)
+        else:
+            _fly(args, chosen)
     return ExitCode.OK
+
+
+@contextmanager
+def _over_ros(args: argparse.Namespace, campaign: Campaign) -> Iterator[Campaign]:
+    """The same campaign, planned by a planner node for the length of the block."""
+    if args.workers is not None or args.ray is not None:
+        raise InvalidInputError("--over-ros", True, "neither --workers nor --ray beside it")
+    from dscp_ros.flights.node_planner import node_planner
+
+    args.output.mkdir(parents=True, exist_ok=True)
+    log = args.output / "planner.log"
+    with node_planner(args.problem, campaign.problem, campaign.settings, log) as planner:
+        yield replace(campaign, planner=planner)
 
 
 def make_campaign(args: argparse.Namespace) -> Campaign:
@@ -184,6 +206,8 @@ def replay_command(args: argparse.Namespace, seed: int) -> str:
     for option in ("vehicle", "formulation", "intervals", "solver", "dispersions"):
         if getattr(args, option) is not None:
             words += [f"--{option}", str(getattr(args, option))]
+    if args.over_ros:
+        words.append("--over-ros")
     if args.free_terminal_time is False:
         words.append("--no-free-terminal-time")
     return shlex.join([*words, "--replay", str(seed)])

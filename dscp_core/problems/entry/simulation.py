@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -116,7 +117,8 @@ class EntrySimulation:
         limits = {f"{name}_max": kept * float(self._values[f"{name}_max"]) for name in LIMITED}
         # A mission's least time is that of the whole flight; every replan has less to go.
         limits["terminal_time_min"] = planner.problem.table["terminal_time_min"].lower
-        self.planner = Planner(planner.problem, planner.settings, parameters=limits)
+        self.planner = copy.copy(planner)
+        self.planner.parameters = planner.problem.table.pack(limits, planner.parameters)
         self._motion = TrueMotion(planner.problem)
         self._target = Target.of(self._values)
         # Every copy begins with the same plan: what a solver was set up with stays in the last
