@@ -29,7 +29,7 @@ from dscp_core.errors import DscpError, InvalidInputError
 from dscp_core.planning.attempt import Attempt
 from dscp_core.planning.plan import PlanOutcome, PlanStatus
 from dscp_core.planning.planner import Planner, PlannerSettings
-from dscp_core.problem.declaration import OptimalControlProblem
+from dscp_core.problem.declaration import TERMINAL_TIME, OptimalControlProblem
 from dscp_core.problem.trajectory import Plan
 from dscp_ros.demo.processes import Child, child
 from dscp_ros.planner.declaration import VEHICLE_PREFIX
@@ -208,7 +208,7 @@ class NodePlanner(Planner):
             packed = self.check_state(state)
         except InvalidInputError as error:
             return attempt.invalid(str(error), self.parameters, source)
-        self._tell_parameters()
+        self._tell_parameters(warm_start, elapsed_s)
         self._link.stamp_ns = self._next_stamp_ns(warm_start, elapsed_s)
         message = joint_state_from_state(StampedState(self._link.stamp_ns, state), self._layout)
         report, trajectory = self._link.ask(message, self._link.stamp_ns)
@@ -233,10 +233,18 @@ class NodePlanner(Planner):
             warm_started=figures.warm_started,
         )
 
-    def _tell_parameters(self) -> None:
-        """Set what the node's parameters differ in."""
+    def _tell_parameters(self, warm_start: Plan | None, elapsed_s: float) -> None:
+        """Set what the node's parameters differ in.
+
+        A changed parameter makes the node forget its warm start; what is left of the time is told.
+        """
         changed = {}
-        for name, value in self.problem.table.unpack(self.parameters).items():
+        values = self.problem.table.unpack(self.parameters)
+        if warm_start is not None:
+            declared = self.problem.table[TERMINAL_TIME]
+            left_s = warm_start.terminal_time_s - elapsed_s
+            values[TERMINAL_TIME] = float(np.clip(left_s, declared.lower, declared.upper))
+        for name, value in values.items():
             full = VEHICLE_PREFIX + name
             if full not in self._link.told:  # of the initial state, which every state sets
                 continue
