@@ -200,7 +200,8 @@ class GuidanceSettings:
             own = {"profile_deceleration_m_s2": min(0.41 * gravity, 0.35 * most)}
         else:
             # Least thrust has to leave authority downwards: else it stops metres up, and falls.
-            braking = max(least, 0.0) + max(3.5, 0.3 * least)
+            # The more thrust is to be shed at the gate, the more of it.
+            braking = max(least, 0.0) + max(3.5, 0.3 * least, 0.08 * (most - least))
             own = {
                 "profile_deceleration_m_s2": braking,
                 "contact_descent_m_s": 0.5,
