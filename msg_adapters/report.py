@@ -47,6 +47,13 @@ class CheckFigures:
     time_s: float | None
     passed: bool
 
+    @property
+    def margin(self) -> float | None:
+        """What is left between value and bound, in ``unit``; negative beyond it."""
+        if self.worst_value is None or self.bound is None:
+            return None
+        return _known(self.bound - self.worst_value)
+
 
 @dataclass(frozen=True)
 class CertificateFigures:
@@ -56,7 +63,7 @@ class CertificateFigures:
         passed: Whether the plan may be flown.
         reasons: Why not; empty if it passed.
         values: What a flight comes to, by name and unit: the misses of this problem, for example
-            ``miss_position_m``, and ``mass_used_kg`` where the state has a mass.
+            ``miss_position_m``, and whatever else the certificate knows, such as ``mass_used_kg``.
         checks: Every constraint.
     """
 
@@ -85,6 +92,11 @@ class AttemptFigures:
         terminal_time_source: Where the terminal time comes from.
         terminal_time_reason: Why from there, where the node's settings name another source.
         converged: Whether the iterations had settled; None in reports of before 2026-11.
+        stopped: Why the iterations stopped; None if they never started, and in reports of before
+            2026-12.
+        cost_to_gain: What the plan costs more than a local optimum, at most (an estimate); None if
+            unknown.
+        cost_unit: Unit of both; None in reports of before 2026-12.
     """
 
     iterations: int
@@ -101,6 +113,9 @@ class AttemptFigures:
     terminal_time_source: str | None = None
     terminal_time_reason: str | None = None
     converged: bool | None = None
+    stopped: str | None = None
+    cost_to_gain: float | None = None
+    cost_unit: str | None = None
 
 
 @dataclass(frozen=True)
@@ -184,6 +199,9 @@ def attempt_from_outcome(outcome: PlanOutcome, deadline_s: float | None) -> Atte
         terminal_time_source=outcome.terminal_time_source.value,
         terminal_time_reason=outcome.terminal_time_reason or None,
         converged=bool(outcome.converged),
+        stopped=None if outcome.stopped is None else outcome.stopped.value,
+        cost_to_gain=_known(outcome.cost_to_gain),
+        cost_unit=outcome.cost_unit,
     )
 
 
@@ -217,13 +235,16 @@ def figures_from_certificate(
 
 
 def _values(certificate: PlanCertificate, misses: Collection[str]) -> dict[str, float]:
-    """Misses and used mass by name and unit; those that are known."""
+    """Misses and other figures of the flight by name and unit; those that are known."""
+    from dscp_core.planning.plan import flight_figures
+
     found = {
         key_of(check.name, check.unit): _known(check.worst_value)
         for check in certificate.checks
         if check.name in misses
     }
-    found["mass_used_kg"] = _known(certificate.mass_used_kg)
+    for name, value in flight_figures(certificate).items():
+        found[name] = _known(value)
     return {key: value for key, value in found.items() if value is not None}
 
 

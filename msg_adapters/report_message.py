@@ -5,14 +5,16 @@ One status per message. Keys without a known value are left out. Keys:
 - always: ``code``, ``code_name``, ``source``, ``published``, ``drops``, ``rejected``
 - if known: ``input_stamp`` (seconds.nanoseconds), ``latency_ms``, ``mass_source``,
   ``parameter_set``, ``state.NAME``
-- after an attempt: ``iterations``, ``converged``, ``solve_time_ms``, ``solver_time_ms``,
-  ``deadline_ms``, ``virtual_control``, ``max_defect``, ``cost``, ``terminal_time_predicted_s``,
+- after an attempt: ``iterations``, ``converged``, ``stopped`` (why the iterations did),
+  ``solve_time_ms``, ``solver_time_ms``, ``deadline_ms``, ``virtual_control``, ``max_defect``,
+  ``cost``, ``cost_to_gain``, ``cost_unit`` (of both), ``terminal_time_predicted_s``,
   ``terminal_time_used_s``, ``terminal_time_source``, ``terminal_time_reason``, ``warm_started``,
   ``solver``
 - with a certificate: ``certificate.passed``, ``certificate.reason.K``, ``certificate.NAME_UNIT``
   of each miss of the problem (for a landing ``certificate.miss_position_m`` and
-  ``certificate.miss_speed_m_s``), ``certificate.mass_used_kg`` where the state has a mass,
-  ``certificate.check.K.FIELD`` with the fields of `report.CheckFigures`
+  ``certificate.miss_speed_m_s``) and of whatever else the certificate knows
+  (``certificate.mass_used_kg``), ``certificate.check.K.FIELD`` with the fields of
+  `report.CheckFigures` and their ``margin``
 - after a refusal: ``field``, ``value``, ``bound``
 """
 
@@ -55,6 +57,7 @@ _NUMBERS = (
     "virtual_control",
     "max_defect",
     "cost",
+    "cost_to_gain",
     "terminal_time_predicted_s",
     "terminal_time_used_s",
 )
@@ -111,8 +114,10 @@ def _pairs(report: PlanReport) -> Iterator[tuple[str, Value]]:
     if report.attempt is not None:
         yield "iterations", report.attempt.iterations
         yield "converged", report.attempt.converged
+        yield "stopped", report.attempt.stopped
         for key in _NUMBERS:
             yield key, getattr(report.attempt, key)
+        yield "cost_unit", report.attempt.cost_unit
         yield "warm_started", report.attempt.warm_started
         yield "solver", report.attempt.solver
         yield "terminal_time_source", report.attempt.terminal_time_source
@@ -137,6 +142,7 @@ def _certificate_pairs(certificate: CertificateFigures) -> Iterator[tuple[str, V
         yield prefix + "name", check.name
         for key in _CHECK_NUMBERS:
             yield prefix + key, getattr(check, key)
+        yield prefix + "margin", check.margin
         yield prefix + "unit", check.unit
         yield prefix + "passed", check.passed
 
@@ -201,6 +207,8 @@ def _attempt(reader: KeyValueReader) -> AttemptFigures | None:
         iterations=reader.integer("iterations"),
         warm_started=reader.boolean("warm_started"),
         converged=reader.boolean("converged") if "converged" in reader.texts else None,
+        stopped=reader.optional_text("stopped"),
+        cost_unit=reader.optional_text("cost_unit"),
         solver=reader.optional_text("solver"),
         terminal_time_source=reader.optional_text("terminal_time_source"),
         terminal_time_reason=reader.optional_text("terminal_time_reason"),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-import time
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -16,6 +16,7 @@ from dscp_core.planning.plan import PlanOutcome, PlanStatus, TerminalTime
 from dscp_core.problem.declaration import TERMINAL_TIME, OptimalControlProblem
 from dscp_core.problem.flight import Discretisation
 from dscp_core.problem.trajectory import Plan
+from dscp_core.scp.gain import cost_to_gain
 from dscp_core.scp.restoration import restored
 from dscp_core.scp.scp import Iteration, Scp, ScpResult, ScpStatus
 
@@ -55,7 +56,7 @@ class Attempt:
         self,
         problem: OptimalControlProblem,
         verifier: PlanVerifier,
-        started: float,
+        clock: Callable[[], float],
         deadline_s: float | None,
     ) -> None:
         """Begin.
@@ -63,12 +64,13 @@ class Attempt:
         Args:
             problem: What is planned.
             verifier: Certifies the plans.
-            started: When the call came, by ``time.perf_counter``.
-            deadline_s: Wall time from then on for the iterations of all runs, or None.
+            clock: Seconds; the call came now.
+            deadline_s: Wall time from now on for the iterations of all runs, or None.
         """
         self._problem = problem
         self._verifier = verifier
-        self._started = started
+        self._clock = clock
+        self._started = clock()
         self._deadline_s = deadline_s
         self._iterations = 0
         self._solver_time = 0.0
@@ -84,7 +86,7 @@ class Attempt:
         return replace(
             outcome,
             iterations=self._iterations,
-            solve_time_s=time.perf_counter() - self._started,
+            solve_time_s=self._elapsed(),
             solver_time_s=self._solver_time,
         )
 
@@ -99,14 +101,18 @@ class Attempt:
         """Wall time that is left, not below zero; None without a deadline."""
         if self._deadline_s is None:
             return None
-        return max(self._deadline_s - (time.perf_counter() - self._started), 0.0)
+        return max(self._deadline_s - self._elapsed(), 0.0)
 
     def run(self, start: Start) -> PlanOutcome:
         """Iterate, choose an iterate, certify it."""
         scp = start.scp
         left = self.left_s()
+        if left == 0.0:
+            late, message = ScpStatus.DEADLINE, "deadline: no time left to start"
+            packed, source = start.parameters, start.source
+            return self._outcome(PlanStatus.DEADLINE, message, packed, source, stopped=late)
         if left is not None:
-            scp = scp.with_options(deadline_s=max(left, 1e-6))
+            scp = scp.with_options(deadline_s=left)
         try:
             result = scp.run(start.parameters, start.reference)
         except InvalidInputError as error:  # a guess that is not finite
@@ -149,6 +155,7 @@ class Attempt:
                 "converged": result.status is ScpStatus.CONVERGED
                 and chosen is result.iterations[-1]
                 and _satisfies_dynamics(scp, chosen),
+                "cost_to_gain": cost_to_gain(scp, chosen),
                 "plan": plan,
                 "certificate": certificate,
                 "terminal_time_used_s": plan.terminal_time_s,
@@ -171,6 +178,7 @@ class Attempt:
         values: dict[str, Any] = {
             "stopped": None,
             "converged": False,
+            "cost_to_gain": None,
             "plan": None,
             "certificate": None,
             "virtual_control": math.inf,
@@ -184,7 +192,7 @@ class Attempt:
             status=status,
             message=message,
             iterations=self._iterations,
-            solve_time_s=time.perf_counter() - self._started,
+            solve_time_s=self._elapsed(),
             solver_time_s=self._solver_time,
             cost_unit=self._problem.cost_unit,
             terminal_time_predicted_s=self.predicted_s,
@@ -193,6 +201,9 @@ class Attempt:
             parameters=parameters,
             **(values | found),
         )
+
+    def _elapsed(self) -> float:
+        return self._clock() - self._started
 
     def plan_of(
         self, states: Array, controls: Array, terminal_time_s: float, parameters: Array

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from enum import Enum, IntEnum
 from typing import Any
 
@@ -81,11 +82,18 @@ class BestEffort:
 class PlanOutcome:
     """Everything about one attempt.
 
+    Three words say three things: a plan is *certified* if it can be flown (`certificate` has every
+    check with its margin), *converged* if its cost is that of a local optimum (`cost_to_gain` has
+    what may be missing), and `stopped` says why the iterations stopped.
+
     Attributes:
         status: What became of it.
         stopped: Why the iterations stopped; None when they never started.
         converged: Whether they stopped because nothing changed any more, and the plan is where
             they did, satisfying the dynamics: only then is its cost that of a local optimum.
+        cost_to_gain: Estimate, from above, of what the plan costs more than a local optimum, in
+            ``cost_unit``, converged or not; see `dscp_core.scp.gain.cost_to_gain`. None if it is
+            unknown: without a plan, or with one that keeps virtual control.
         message: In words, with numbers.
         plan: The trajectory, also of an attempt that was not certified; None without any.
         certificate: Its check, or None.
@@ -119,6 +127,7 @@ class PlanOutcome:
     status: PlanStatus
     stopped: ScpStatus | None
     converged: bool
+    cost_to_gain: float | None
     message: str
     plan: Plan | None
     certificate: PlanCertificate | None
@@ -145,7 +154,7 @@ class PlanOutcome:
 
     @property
     def headline(self) -> str:
-        """What this is worth, in one line: feasible? converged? at which cost?"""
+        """What this is worth, in one line: certified? converged, or why not? what is to gain?"""
         words, why = _WORDS[self.status], " ".join(self.message.split())
         if self.status not in (PlanStatus.CERTIFIED, PlanStatus.NOT_CERTIFIED):
             return f"{words}: {why}"
@@ -153,19 +162,39 @@ class PlanOutcome:
             words += f" ({self.certificate.reasons[0]})"
         unit = "" if self.cost_unit == "1" else f" {self.cost_unit}"
         source = self.terminal_time_source.value
-        facts = f"terminal time {self.terminal_time_used_s:.4g} s ({source}), cost {self.cost:.7g}"
+        gain = "unknown how much to gain"
+        if self.cost_to_gain is not None:
+            gain = f"at most {_rounded_up(self.cost_to_gain)}{unit} to gain"
+        return (
+            f"{words}, {self._settled}: terminal time {self.terminal_time_used_s:.4g} s "
+            f"({source}), cost {self.cost:.7g}{unit}, {gain}"
+        )
+
+    @property
+    def _settled(self) -> str:
+        """Whether the iterations converged, and why that cannot be said."""
         if self.converged:
-            return f"{words}, converged: {facts}{unit}"
-        return f"{words}, {_doubt(self.stopped)}: {facts}{unit}, which may not be the least"
+            return "converged"
+        if self.stopped is ScpStatus.FIXED_ITERATIONS:
+            return f"convergence NOT TESTED ({self.stopped.value})"
+        if self.stopped is ScpStatus.CONVERGED:
+            return "NOT CONVERGED (where the iterations stopped, the dynamics do not hold)"
+        return f"NOT CONVERGED ({'no iterations' if self.stopped is None else self.stopped.value})"
 
 
-def _doubt(stopped: ScpStatus | None) -> str:
-    """Why a plan's iterations cannot be called converged."""
-    if stopped is ScpStatus.FIXED_ITERATIONS:
-        return f"convergence NOT TESTED ({stopped.value})"
-    if stopped is ScpStatus.CONVERGED:
-        return "NOT CONVERGED (where the iterations stopped, the dynamics do not hold)"
-    return f"NOT CONVERGED ({'no iterations' if stopped is None else stopped.value})"
+def flight_figures(certificate: PlanCertificate) -> dict[str, float]:
+    """What the flight of a certificate comes to besides its checks: figures that it knows, by name.
+
+    Example names: ``mass_used_kg``; the unit is part of each.
+    """
+    found = {f.name: getattr(certificate, f.name) for f in fields(certificate)}
+    return {name: float(value) for name, value in found.items() if isinstance(value, float)}
+
+
+def _rounded_up(value: float) -> str:
+    """Two significant digits that are not below the value."""
+    unit = 10.0 ** (math.floor(math.log10(value)) - 1)
+    return f"{math.ceil(value / unit) * unit:.7g}"
 
 
 _WORDS = {

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -56,7 +56,8 @@ class Planner:
         >>> from dscp_core import Planner, problems
         >>> planner = Planner(problems.get("powered_descent"))
         >>> planner.plan().headline
-        'certified, converged: terminal time 32.81 s (fixed), cost -31760.3 kg'
+        'certified, converged: terminal time 32.81 s (fixed), cost -31760.3 kg,
+        at most 0... kg to gain'
         >>> planner.state_names
         ('x', 'y', 'z', 'vx', 'vy', 'vz', 'mass')
         >>> planner.plan([4000.0, 400.0, 400.0, -90.0, 30.0, -30.0, 38000.0]).certified
@@ -71,6 +72,7 @@ class Planner:
         *,
         vehicle: str | Path | None = None,
         parameters: Mapping[str, Value] | None = None,
+        clock: Callable[[], float] = time.perf_counter,
         **changes: Any,
     ) -> None:
         """Compile the problem.
@@ -81,6 +83,7 @@ class Planner:
             predictor: Needed for, and only for, `TerminalTime.PREDICTED`.
             vehicle: YAML file of parameter names and SI values, which win over the settings'.
             parameters: Values by name, SI, which win over both.
+            clock: Seconds, by which deadlines and times are told.
             **changes: Other settings by name, such as ``intervals=20``, which win.
 
         Raises:
@@ -103,6 +106,7 @@ class Planner:
             )
         self.settings = settings
         self._predictor = predictor
+        self._clock = clock
         self.problem = problem
         self.parameters = self.problem.pack(settings.parameters)
         self.scp = self._loop(free=settings.terminal_time is TerminalTime.FREE)
@@ -118,7 +122,7 @@ class Planner:
             self._fallback = Fallback(self._loop(free=True), self._verifier)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """By what it was made of; the copy compiles its own functions."""
+        """By what it was made of; the copy compiles its own functions, and has the usual clock."""
         return Planner, (self.problem, self.settings, self._predictor)
 
     def _loop(self, *, free: bool) -> Scp:
@@ -129,7 +133,7 @@ class Planner:
             discretisation=self.settings.discretisation,
             hold=self.settings.hold,
         )
-        return Scp(transcription, self.settings.options)
+        return Scp(transcription, self.settings.options, self._clock)
 
     def _bounds_of_time(self) -> tuple[float, float]:
         """Least and greatest terminal time where it is free, in seconds.
@@ -211,7 +215,7 @@ class Planner:
             elapsed_s: Flight time between that plan's start and this state.
         """
         state = self.initial_state if state is None else state
-        attempt = Attempt(self.problem, self._verifier, time.perf_counter(), deadline_s)
+        attempt = Attempt(self.problem, self._verifier, self._clock, deadline_s)
         source = self.settings.terminal_time
         try:
             packed = self.check_state(state)
@@ -358,7 +362,7 @@ class Planner:
 
         Args:
             outcome: With a plan.
-            title: Headline; by default verdict, terminal time, and what else counts.
+            title: Headline; by default the problem and the outcome's headline.
 
         Raises:
             InvalidInputError: There is no plan.
@@ -373,7 +377,7 @@ class Planner:
             )
         if outcome.plan is None or outcome.certificate is None:
             raise InvalidInputError("outcome", outcome.headline, "one with a plan")
-        if title is None and not outcome.converged:
+        if title is None:
             title = f"{name}: {outcome.headline}"
         return plan_figure(
             self.problem, outcome.plan, outcome.certificate, outcome.parameters, title

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -103,9 +104,22 @@ class Scp:
     Not safe for runs from several threads at once.
     """
 
-    def __init__(self, transcription: Transcription, options: ScpOptions | None = None) -> None:
+    def __init__(
+        self,
+        transcription: Transcription,
+        options: ScpOptions | None = None,
+        clock: Callable[[], float] = time.perf_counter,
+    ) -> None:
+        """Compile nothing yet, but bind the solver.
+
+        Args:
+            transcription: What is solved.
+            options: How to iterate.
+            clock: Seconds, by which deadlines and times are told.
+        """
         self.transcription = transcription
         self.options = options or ScpOptions()
+        self.clock = clock
         self.kkt = KktSystem(transcription.pattern)
         self._solver = make_solver(
             self.options.solver, transcription.pattern, self.options.solver_settings
@@ -113,7 +127,7 @@ class Scp:
 
     def __reduce__(self) -> tuple[Any, ...]:
         """By what it was made of; the copy has a solver and symbolic work of its own."""
-        return Scp, (self.transcription, self.options)
+        return Scp, (self.transcription, self.options, self.clock)
 
     @property
     def cost_tolerance(self) -> float:
@@ -138,6 +152,7 @@ class Scp:
         options = replace(self.options, **changes)
         copy = object.__new__(Scp)
         copy.transcription, copy.options, copy.kkt = self.transcription, options, self.kkt
+        copy.clock = self.clock
         same = (options.solver, options.solver_settings) == (
             self.options.solver,
             self.options.solver_settings,
@@ -168,7 +183,8 @@ class _Run:
     """State of one run."""
 
     def __init__(self, scp: Scp, parameters: Array, initial_reference: Array | None) -> None:
-        self._start = time.perf_counter()
+        self._clock = scp.clock
+        self._start = self._clock()
         self._scp = scp
         self._options = scp.options
         self._transcription = scp.transcription
@@ -227,27 +243,27 @@ class _Run:
     def _remaining(self) -> float | None:
         if self._options.deadline_s is None:
             return None
-        return self._options.deadline_s - (time.perf_counter() - self._start)
+        return self._options.deadline_s - (self._clock() - self._start)
 
     def _iterate(
         self, reference: Array, before: Evaluation, time_limit_s: float | None
     ) -> tuple[Iteration | ConeSolution, Evaluation]:
         transcription, layout = self._transcription, self._transcription.layout
-        started = time.perf_counter()
+        started = self._clock()
         values = transcription.values(reference, self._parameters)
-        assembled = time.perf_counter()
+        assembled = self._clock()
         try:
             solution = self._scp.solve(values, time_limit_s)
         except NotConvexError:
             raise transcription.not_convex(reference, self._parameters) from None
-        solved = time.perf_counter()
+        solved = self._clock()
         if solution.status is not SolveStatus.SOLVED:
             return solution, before
         linearisation = None
         if self._options.polish:
             linearisation = self._scp.kkt.linearise(values, solution)
             solution = linearisation.solution
-        polished = time.perf_counter()
+        polished = self._clock()
         evaluation = transcription.evaluate(solution.z[: reference.size], self._parameters)
         iteration = Iteration(
             reference=reference,
@@ -260,7 +276,7 @@ class _Run:
             predicted_change=self._predicted_change(values, reference, before, solution.z),
             defects=evaluation.defects,
             virtual_control=layout.virtual_control(solution.z),
-            assembly_seconds=assembled - started + time.perf_counter() - polished,
+            assembly_seconds=assembled - started + self._clock() - polished,
             solve_seconds=solved - assembled,
             polish_seconds=polished - solved,
         )
@@ -339,7 +355,7 @@ class _Run:
             parameters=self._parameters,
             initial_reference=self._initial,
             warm_started=self._warm,
-            seconds=time.perf_counter() - self._start,
+            seconds=self._clock() - self._start,
             failed=failed,
         )
 

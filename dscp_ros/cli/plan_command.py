@@ -38,8 +38,9 @@ Plans one trajectory and certifies it: the true dynamics are integrated under th
 and every constraint is checked between the nodes too. Without options it is the problem's own case.
 
 Units are SI and angles are in rad. A plan for which no certificate can be given is no plan: exit
-code 3. The first line says more: a certified plan whose iterations had not converged can be flown,
-but another may cost less.
+code 3. The first line says three things: whether the plan is certified (it can be flown; each check
+follows with its margin), whether its iterations converged and if not why they stopped, and what may
+at most be missing to the least cost nearby.
 """
 
 EPILOG = """\
@@ -58,13 +59,15 @@ examples:
 A vehicle file holds lines such as `initial_mass: 25000` and `initial_velocity: [-90, 0, 0]`.
 
 --json prints one object: headline, status (certified, not_certified, infeasible, iteration_limit,
-deadline, solver_failure), message, certified, converged, terminal_time_s, iterations, cost,
-cost_unit, subproblem_costs (what the iterations minimise of the running and the terminal cost),
-final_STATE_UNIT for every state (such as final_mass_kg), certificate (with MISS_UNIT for
-every miss, such as miss_position_m), solve_time_ms, solver, virtual_control, max_defect,
-least_feasible_terminal_time_s, best_effort (with --best-effort and no certified plan: violations,
-steps, terminal_time_s, final_STATE_UNIT, certificate; --plot and --output then draw and write it).
-null stands for what does not exist.
+deadline, solver_failure), message, certified, converged, stopped (why the iterations stopped),
+cost_to_gain (what the plan costs more than a local optimum, at most, in the cost's unit; an
+estimate), terminal_time_s, iterations, cost, cost_unit, subproblem_costs (what the iterations
+minimise of the running and the terminal cost), final_STATE_UNIT for every state (such as
+final_mass_kg), certificate (with MISS_UNIT for every miss, such as miss_position_m, and checks with
+name, worst_value, bound, margin, unit, time_s, passed), solve_time_ms, solver, virtual_control,
+max_defect, least_feasible_terminal_time_s, best_effort (with --best-effort and no certified plan:
+violations, steps, terminal_time_s, final_STATE_UNIT, certificate; --plot and --output then draw and
+write it). null stands for what does not exist or is unknown.
 
 exit codes: 0 certified plan, 2 bad input, 3 no such plan.
 """
@@ -149,6 +152,8 @@ def describe(planner: Planner, outcome: PlanOutcome, least_s: float | None) -> d
         "message": outcome.message,
         "certified": outcome.certified,
         "converged": outcome.converged,
+        "stopped": None if outcome.stopped is None else outcome.stopped.value,
+        "cost_to_gain": outcome.cost_to_gain,
         "terminal_time_s": outcome.terminal_time_used_s,
         "terminal_time_source": settings.terminal_time,
         "least_feasible_terminal_time_s": least_s,
@@ -238,17 +243,21 @@ def _flyable(outcome: PlanOutcome) -> Plan | None:
 
 
 def _certificate(problem: OptimalControlProblem, certificate: PlanCertificate) -> dict[str, Any]:
+    from dscp_core.planning.plan import flight_figures
+
     worst = {check.name: check.worst_value for check in certificate.checks}
     # Missing where the flight could not be integrated to its end.
     missed = {with_unit(miss.name, miss.unit): worst.get(miss.name) for miss in problem.end_checks}
-    used = certificate.mass_used_kg
     return {
         "passed": certificate.passed,
         "reasons": certificate.reasons,
         **missed,
-        **({} if used is None else {"mass_used_kg": used}),
+        **flight_figures(certificate),
         "control_hold": certificate.hold,
-        "checks": [asdict(check) for check in certificate.checks],
+        "checks": [
+            {**asdict(check), "margin": check.bound - check.worst_value}
+            for check in certificate.checks
+        ],
     }
 
 
@@ -273,6 +282,8 @@ def _write(
 
 
 def _print(described: dict[str, Any], planner: Planner, outcome: PlanOutcome) -> None:
+    from dscp_core.planning.plan import flight_figures
+
     problem, certificate = planner.problem, described["certificate"]
     form = f"{problem.formulation}, " if problem.formulation else ""
     print(f"{problem.name} ({form}{planner.settings.intervals} intervals): {outcome.headline}")
@@ -294,25 +305,30 @@ def _print(described: dict[str, Any], planner: Planner, outcome: PlanOutcome) ->
             for state, start, end in ends[:_MOST_FINAL_STATES]
         ]
     solver = f", of which {described['solver_time_ms']:.1f} ms in {outcome.solver}"
-    time = f"{described['solve_time_ms']:.1f} ms"
+    time = f"{described['stopped'] or 'none begun'}; {described['solve_time_ms']:.1f} ms"
     rows.append(("iterations", str(outcome.iterations), time + (solver if outcome.solver else "")))
     widths = [max(len(row[column]) for row in rows) for column in (0, 1)]
     for label, value, note in rows:
         print(f"  {label:<{widths[0]}}  {value:>{widths[1]}}  {note}".rstrip())
-    if plan is None or certificate is None:
+    if plan is None or outcome.certificate is None:
         return
     print("  certificate, flown with the controls held at interval means:")
     checks = [
         (
             check["name"],
             f"{check['worst_value']:.4g}",
-            f"{check['bound']:g} {check['unit']}",
+            f"{check['bound']:g}",
+            f"{check['margin']:.4g}",
+            check["unit"],
             f"{check['time_s']:.2f} s",
             "passed" if check["passed"] else "FAILED",
         )
         for check in certificate["checks"]
     ]
-    print_table(("check", "worst", "bound", "at", ""), checks, indent="    ")
+    print_table(("check", "worst", "bound", "margin", "unit", "at", ""), checks, indent="    ")
+    figures = flight_figures(outcome.certificate)
+    if figures:
+        print("    flown: " + ", ".join(f"{name} {value:.7g}" for name, value in figures.items()))
 
 
 def _quantity(value: float, unit: str) -> str:

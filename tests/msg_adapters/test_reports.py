@@ -42,6 +42,8 @@ attempts = st.builds(
     iterations=COUNTS,
     warm_started=st.booleans(),
     converged=st.none() | st.booleans(),
+    stopped=st.none() | TEXT,
+    cost_unit=st.none() | TEXT,
     solver=st.none() | TEXT,
     terminal_time_source=st.none() | TEXT,
     terminal_time_reason=st.none() | TEXT,
@@ -53,6 +55,7 @@ attempts = st.builds(
             "virtual_control",
             "max_defect",
             "cost",
+            "cost_to_gain",
             "terminal_time_predicted_s",
             "terminal_time_used_s",
         ),
@@ -115,6 +118,7 @@ def outcome(**changes) -> PlanOutcome:
         "status": PlanStatus.CERTIFIED,
         "stopped": ScpStatus.CONVERGED,
         "converged": True,
+        "cost_to_gain": 0.25,
         "message": "certified",
         "plan": None,
         "certificate": None,
@@ -147,6 +151,8 @@ def test_outcome_becomes_figures_in_milliseconds():
     assert attempt.warm_started is True
     assert attempt.converged is True
     assert attempt_from_outcome(outcome(converged=False), 1.0).converged is False
+    assert (attempt.stopped, attempt.cost_to_gain, attempt.cost_unit) == ("converged", 0.25, "kg")
+    assert attempt_from_outcome(outcome(stopped=None, cost_to_gain=None), 1.0).stopped is None
     assert attempt.solver == "qoco"
     assert attempt.terminal_time_source == "free"
     assert attempt.terminal_time_reason is None

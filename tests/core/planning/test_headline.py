@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import pytest
@@ -20,8 +21,10 @@ def test_a_certified_converged_plan_says_both() -> None:
     outcome = planner().plan()
     assert outcome.certified
     assert outcome.converged
-    assert outcome.headline == (
-        "certified, converged: terminal time 32.81 s (fixed), cost -31760.37 kg"
+    assert re.fullmatch(
+        r"certified, converged: terminal time 32.81 s \(fixed\), cost -31760.37 kg, "
+        r"at most 0\.\d+ kg to gain",
+        outcome.headline,
     )
 
 
@@ -31,7 +34,28 @@ def test_a_certified_plan_at_the_iteration_limit_says_that_it_is_not_converged()
     assert outcome.stopped is ScpStatus.ITERATION_LIMIT
     assert not outcome.converged
     assert outcome.headline.startswith("certified, NOT CONVERGED (iteration limit): ")
-    assert outcome.headline.endswith("which may not be the least")
+    assert re.search(r", cost -31760\.\d+ kg, at most [\d.]+ kg to gain$", outcome.headline)
+
+
+@pytest.mark.parametrize(
+    ("gain", "words"),
+    [
+        (None, "unknown how much to gain"),
+        (0.9951, "at most 1 kg to gain"),
+        (0.00331, "at most 0.0034 kg to gain"),
+        (292.3, "at most 300 kg to gain"),
+        (12345.0, "at most 13000 kg to gain"),
+    ],
+)
+def test_what_is_to_gain_is_rounded_up(gain: float | None, words: str) -> None:
+    assert replace(planner().plan(), cost_to_gain=gain).headline.endswith(f" kg, {words}")
+
+
+def test_where_nothing_is_feasible_what_is_to_gain_is_unknown() -> None:
+    outcome = Planner(problems.get("powered_descent"), parameters={"terminal_time": 31.0}).plan()
+    assert outcome.plan is not None
+    assert outcome.cost_to_gain is None
+    assert planner().plan(deadline_s=1e-4).cost_to_gain is None
 
 
 def test_a_fixed_number_of_iterations_is_no_convergence() -> None:
