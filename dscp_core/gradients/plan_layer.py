@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -13,7 +13,8 @@ from dscp_core.errors import InvalidInputError
 from dscp_core.gradients.gradient import Gradient, Method
 from dscp_core.gradients.losses import Loss
 from dscp_core.gradients.run import of_plan, settle
-from dscp_core.gradients.torch_layer import LossLayer, SampleReport
+from dscp_core.gradients.samples import SampleReport
+from dscp_core.gradients.torch_layer import LossLayer
 from dscp_core.problem.declaration import TERMINAL_TIME
 from dscp_core.scp.scp import Scp, ScpResult, ScpStatus
 
@@ -27,8 +28,9 @@ class PlanLayer(LossLayer):
     ``loss.nansum()`` leaves it out.
 
     Attributes:
-        samples: What became of every sample of the last call; its backward pass completes them
-            with the verdict on their gradients.
+        samples: What became of every sample of the last call: certified or not, converged or not
+            with what there is to gain, and why the iterations stopped. Its backward pass completes
+            them with the verdict on their gradients.
 
     Example:
         >>> import torch
@@ -43,7 +45,13 @@ class PlanLayer(LossLayer):
     """
 
     def __init__(
-        self, scp: Scp, inputs: Sequence[str], loss: Loss, parameters: Array, method: Method
+        self,
+        scp: Scp,
+        inputs: Sequence[str],
+        loss: Loss,
+        parameters: Array,
+        method: Method,
+        certify: Callable[[ScpResult], bool],
     ) -> None:
         """Choose inputs and loss.
 
@@ -53,6 +61,7 @@ class PlanLayer(LossLayer):
             loss: Scalar of a trace.
             parameters: Packed values of all others, SI.
             method: How to differentiate.
+            certify: Whether the last trajectory of a run can be flown.
 
         Raises:
             InvalidInputError: Unknown parameter, or a terminal time that is a decision.
@@ -63,7 +72,7 @@ class PlanLayer(LossLayer):
             raise InvalidInputError(
                 "inputs", TERMINAL_TIME, "other parameters: it is free, a decision of the solver"
             )
-        self._loss = loss
+        self._loss, self._certify = loss, certify
         self.samples: tuple[SampleReport, ...] = ()
 
     def forward(self, **inputs: torch.Tensor) -> torch.Tensor:
@@ -97,6 +106,10 @@ class PlanLayer(LossLayer):
         if not settled.succeeded:
             return settled, settled.message
         return replace(settled, status=trace.status), message
+
+    def certified(self, trace: ScpResult) -> bool | None:
+        """Whether the trajectory, flown with the true dynamics, passes every check."""
+        return self._certify(trace)
 
     def usable(self, trace: ScpResult) -> bool:
         """Whether a run has a loss and a gradient: not where it found no feasible trajectory."""

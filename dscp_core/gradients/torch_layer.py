@@ -20,6 +20,7 @@ from dscp_core.errors import InvalidInputError
 from dscp_core.gradients.gradient import Gradient, Method, parts, positions
 from dscp_core.gradients.losses import Loss, SeedLoss
 from dscp_core.gradients.run import DifferentiationError, implicit, unrolled
+from dscp_core.gradients.samples import SampleReport, report_of
 from dscp_core.problem.declaration import TERMINAL_TIME
 from dscp_core.problem.parameters import Value
 from dscp_core.scp.scp import Scp, ScpResult, ScpStatus
@@ -32,28 +33,6 @@ _WITHOUT_GRADIENT = (
     ScpStatus.SUBPROBLEM_INFEASIBLE,
     ScpStatus.SOLVER_FAILURE,
 )
-
-
-@dataclass
-class SampleReport:
-    """What became of one sample of a batch.
-
-    Attributes:
-        status: Why its iterations stopped; None when they never started.
-        message: In words, with the numbers.
-        iterations: Completed SCP iterations.
-        usable: Whether outputs and gradient mean something; they are zero otherwise. True also
-            for a run that reached its iteration limit or kept virtual control: see `status`.
-        trusted: Verdict on the gradient; None before the backward pass.
-        reasons: Why the gradient is not trusted, or why it was set to zero.
-    """
-
-    status: ScpStatus | None
-    message: str
-    iterations: int
-    usable: bool
-    trusted: bool | None = None
-    reasons: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -114,6 +93,15 @@ class DscpLayer(torch.nn.Module, ABC):
     @abstractmethod
     def output_size(self) -> int:
         """Length M of a sample's output."""
+
+    @property
+    def scp(self) -> Scp:
+        """The loop that runs."""
+        return self._scp
+
+    def certified(self, trace: ScpResult) -> bool | None:
+        """Whether the trajectory of a usable run passes its certificate; None where it has none."""
+        return None
 
     @abstractmethod
     def output(self, trace: ScpResult) -> Array:
@@ -214,13 +202,12 @@ class _Solve(torch.autograd.Function):
         traces: list[ScpResult | None] = []
         for sample, row in enumerate(parameters):
             trace, message = layer.run(row, None if references is None else references[sample])
-            status = None if trace is None else trace.status
-            count = 0 if trace is None else len(trace.iterations)
             usable = trace is not None and layer.usable(trace)
             if trace is not None and usable:
                 outputs[sample] = layer.output(trace)
             traces.append(trace if usable else None)
-            reports.append(SampleReport(status, message, count, usable))
+            certified = None if trace is None or not usable else layer.certified(trace)
+            reports.append(report_of(layer.scp, trace, message, usable, certified))
         ctx.layer, ctx.reports, ctx.traces = layer, reports, traces
         return torch.from_numpy(outputs)
 

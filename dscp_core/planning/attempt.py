@@ -154,7 +154,7 @@ class Attempt:
             found |= {
                 "converged": result.status is ScpStatus.CONVERGED
                 and chosen is result.iterations[-1]
-                and _satisfies_dynamics(scp, chosen),
+                and scp.satisfies_dynamics(chosen),
                 "cost_to_gain": cost_to_gain(scp, chosen),
                 "plan": plan,
                 "certificate": certificate,
@@ -226,7 +226,7 @@ class Attempt:
 def _chosen(scp: Scp, result: ScpResult) -> Iteration | None:
     """The last iterate that satisfies the dynamics, else the last one."""
     for iteration in reversed(result.iterations):
-        if _satisfies_dynamics(scp, iteration):
+        if scp.satisfies_dynamics(iteration):
             return iteration
     return result.iterations[-1] if result.iterations else None
 
@@ -235,11 +235,6 @@ def _flyable(scp: Scp, iteration: Iteration, parameters: Array) -> Array:
     """The iterate's trajectory, without its last defects where the dynamics are the flown ones."""
     trajectory = iteration.solution.z[: iteration.reference.size]
     propagated = scp.transcription.discretisation is Discretisation.PROPAGATED
-    if propagated and _satisfies_dynamics(scp, iteration):
+    if propagated and scp.satisfies_dynamics(iteration):
         return restored(scp.transcription, trajectory, parameters)
     return trajectory
-
-
-def _satisfies_dynamics(scp: Scp, iteration: Iteration) -> bool:
-    defect = scp.transcription.layout.relative(iteration.defects)
-    return defect <= 10.0 * scp.defect_tolerance

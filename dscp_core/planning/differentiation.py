@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -11,7 +12,9 @@ from dscp_core.gradients.gradient import Gradient, Method
 from dscp_core.gradients.losses import ConvergenceLoss, Loss
 from dscp_core.gradients.quantities import quantity
 from dscp_core.gradients.run import DifferentiationError, of_plan, settle
+from dscp_core.planning.certificate import PlanVerifier
 from dscp_core.planning.plan import PlanOutcome, TerminalTime
+from dscp_core.problem.flight import ControlHold
 from dscp_core.problem.trajectory import Plan
 from dscp_core.scp.scp import GRADIENT_TOLERANCE, Scp, ScpResult
 
@@ -19,6 +22,36 @@ from dscp_core.scp.scp import GRADIENT_TOLERANCE, Scp, ScpResult
 # by how many tolerances of the iterations its cost may differ.
 _SAME_TRAJECTORY = 1e-2
 _SAME_COST = 100.0
+
+
+class Certifier:
+    """Says of runs whether their last trajectory can be flown; for layers, so it can be pickled."""
+
+    def __init__(self, scp: Scp, hold: ControlHold) -> None:
+        """Compile the verifier.
+
+        Args:
+            scp: The loop that runs.
+            hold: How the controls are flown.
+        """
+        self._scp, self._hold = scp, hold
+        transcription = scp.transcription
+        self._verifier = PlanVerifier(
+            transcription.problem, transcription.layout.intervals, hold=hold
+        )
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """By what it was made of; the copy compiles its own functions."""
+        return Certifier, (self._scp, self._hold)
+
+    def __call__(self, trace: ScpResult) -> bool:
+        """Whether the flight passes every check."""
+        transcription, z = self._scp.transcription, trace.final_reference
+        layout = transcription.layout
+        seconds = transcription.terminal_time(z, trace.parameters)
+        times = np.linspace(0.0, seconds, layout.intervals + 1)
+        states, controls = layout.states(z), layout.controls(z)
+        return self._verifier.certify(times, states, controls, trace.parameters).passed
 
 
 def differentiable(scp: Scp) -> Scp:

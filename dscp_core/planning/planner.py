@@ -19,7 +19,12 @@ from dscp_core.gradients.losses import Loss
 from dscp_core.gradients.quantities import quantity
 from dscp_core.planning.attempt import Attempt, Start
 from dscp_core.planning.certificate import PlanVerifier
-from dscp_core.planning.differentiation import differentiable, plan_gradient, suited_method
+from dscp_core.planning.differentiation import (
+    Certifier,
+    differentiable,
+    plan_gradient,
+    suited_method,
+)
 from dscp_core.planning.fallback import Fallback
 from dscp_core.planning.least_time import fastest
 from dscp_core.planning.plan import PlanOutcome, PlanStatus, TerminalTime
@@ -355,7 +360,9 @@ class Planner:
 
         loss = quantity(self.problem, of).loss
         scp = differentiable(self.scp)
-        return PlanLayer(scp, inputs, loss, self.parameters, suited_method(loss, method))
+        certify = Certifier(scp, self.settings.hold)
+        chosen = suited_method(loss, method)
+        return PlanLayer(scp, inputs, loss, self.parameters, chosen, certify)
 
     def figure(self, outcome: PlanOutcome, title: str | None = None) -> Figure:
         """The plan of an outcome, or its best effort, as made and as it went when it was flown.

@@ -37,6 +37,10 @@ GRADIENT_TOLERANCE = 1e-12
 """Interior-point tolerance at which weakly active constraints are told from inactive ones."""
 
 
+_SATISFIED = 10.0
+"""Tolerances of the defects up to which a trajectory is said to satisfy the dynamics."""
+
+
 @dataclass(frozen=True)
 class ScpOptions:
     """How to iterate.
@@ -146,6 +150,11 @@ class Scp:
         """Bound on the virtual control: of the options, or else of the problem."""
         given = self.options.virtual_control_tolerance
         return self.transcription.problem.virtual_control_tolerance if given is None else given
+
+    def satisfies_dynamics(self, iteration: Iteration) -> bool:
+        """Whether the defects of an iteration's trajectory are those of a run that has ended."""
+        defect = self.transcription.layout.relative(iteration.defects)
+        return defect <= _SATISFIED * self.defect_tolerance
 
     def with_options(self, **changes: Any) -> Scp:
         """A loop with changed options that shares this one's symbolic work."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
@@ -11,7 +12,16 @@ import pytest
 import torch
 from core.toy_problems import Array, cart
 
-from dscp_core import InvalidInputError, Method, Planner, PlannerSettings, TerminalTime, problems
+from dscp_core import (
+    InvalidInputError,
+    Method,
+    Planner,
+    PlannerSettings,
+    ScpOptions,
+    TerminalTime,
+    problems,
+)
+from dscp_core.gradients.samples import SampleReport
 from dscp_core.scp.trace import ScpStatus
 
 
@@ -79,13 +89,40 @@ def test_a_failed_sample_is_seen_and_harms_no_other(descent: Planner) -> None:
     good, infeasible, below, bad = layer.samples
     assert good.usable
     assert good.trusted
+    assert (good.certified, good.converged) == (True, True)
+    assert 0.0 < good.cost_to_gain < 1.0  # kg
     assert infeasible.status is ScpStatus.INFEASIBLE
     assert below.message.startswith("x: got -100")
     assert "initial_mass" in bad.message
     for sample in (infeasible, below, bad):
         assert not sample.usable
+        assert (sample.certified, sample.cost_to_gain) == (None, None)
+        assert not sample.converged
         assert sample.trusted is False
         assert sample.reasons[0].startswith("zero gradient: ")
+
+
+def test_certified_converged_and_stopped_are_three_things(descent: Planner) -> None:
+    def sample(iterations: int, **options: Any) -> SampleReport:
+        limited = ScpOptions(max_iterations=iterations, **options)
+        planner = Planner(descent.problem, descent.settings, options=limited, intervals=50)
+        layer = planner.layer("cost", ("terminal_time",), method=Method.UNROLLED)
+        layer(terminal_time=torch.tensor([33.0], dtype=torch.float64))
+        return layer.samples[0]
+
+    early, later = sample(1), sample(5, cost_tolerance=1e-14)
+    assert (early.certified, early.converged) == (False, False)
+    assert (later.certified, later.converged) == (True, False)
+    assert early.status is later.status is ScpStatus.ITERATION_LIMIT
+    assert early.cost_to_gain is not None
+    assert later.cost_to_gain is not None
+    assert early.cost_to_gain > later.cost_to_gain > 0.0
+
+
+def test_a_copy_of_a_layer_certifies_too(descent: Planner) -> None:
+    layer = pickle.loads(pickle.dumps(descent.layer("cost", ("terminal_time",))))
+    layer(terminal_time=torch.tensor([33.0], dtype=torch.float64))
+    assert layer.samples[0].certified is True
 
 
 def test_a_network_learns_through_it(small: Planner) -> None:
