@@ -12,6 +12,7 @@ from collections.abc import Iterable, Mapping
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 
 from msg_adapters.errors import InputCode, RejectedInputError
+from msg_adapters.stamps import nanoseconds_from_stamp_text
 
 Value = bool | int | float | str | None
 
@@ -99,6 +100,20 @@ class KeyValueReader:
         if not math.isfinite(value):
             raise self._bad(key, text, "finite")
         return value
+
+    def optional_stamp_ns(self, key: str) -> int | None:
+        """Time in nanoseconds, written as ``SECONDS.NANOSECONDS``; None where the key is missing.
+
+        Raises:
+            RejectedInputError: REPORT_BAD_VALUE.
+        """
+        text = self.texts.get(key)
+        if text is None:
+            return None
+        try:
+            return nanoseconds_from_stamp_text(text)
+        except ValueError:
+            raise self._bad(key, text, "SECONDS.NANOSECONDS") from None
 
     @staticmethod
     def _bad(key: str, text: str, bound: str) -> RejectedInputError:

@@ -25,6 +25,18 @@ class NodeCode(IntEnum):
     """The ROS clock jumped back: memory of stamps and warm start are gone."""
     SUPERSEDED = 903
     """A reset or a clock jump came during the attempt: its plan is not published."""
+    BEST_EFFORT = 904
+    """There is no certified plan; the one that violates least was published as a best effort."""
+    NO_TRAJECTORY = 905
+    """Validity: nothing has been published yet."""
+    RESET = 906
+    """Validity: the node was reset."""
+    RELOADED = 907
+    """Validity: the planner was rebuilt with other parameters, or its files were read again."""
+    STATES_STALE = 908
+    """Validity: no state was accepted for too long."""
+    PLAN_ENDED = 909
+    """Validity: the trajectory's own time has run out."""
 
 
 @dataclass(frozen=True)
@@ -134,6 +146,19 @@ class Rejection:
 
 
 @dataclass(frozen=True)
+class BestEffortFigures:
+    """What a best effort is worth.
+
+    Attributes:
+        violations: What it violates and by how much, the gravest first.
+        steps: What was made least, in this order.
+    """
+
+    violations: tuple[str, ...]
+    steps: tuple[str, ...]
+
+
+@dataclass(frozen=True)
 class PlanReport:
     """One attempt, refused input or event of the node.
 
@@ -156,6 +181,7 @@ class PlanReport:
         attempt: Figures of the attempt, if there was one.
         certificate: The certificate, if there is one.
         rejection: Cause, if the input was refused.
+        best_effort: What the best effort is worth, if one was published.
     """
 
     stamp_ns: int
@@ -175,6 +201,7 @@ class PlanReport:
     attempt: AttemptFigures | None = None
     certificate: CertificateFigures | None = None
     rejection: Rejection | None = None
+    best_effort: BestEffortFigures | None = None
 
 
 def rejection_from_error(error: RejectedInputError) -> Rejection:

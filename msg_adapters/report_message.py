@@ -16,6 +16,7 @@ One status per message. Keys without a known value are left out. Keys:
   (``certificate.mass_used_kg``), ``certificate.check.K.FIELD`` with the fields of
   `report.CheckFigures` and their ``margin``
 - after a refusal: ``field``, ``value``, ``bound``
+- with a best effort: ``best_effort.violation.K``, ``best_effort.step.K``; the certificate is its
 """
 
 from __future__ import annotations
@@ -26,10 +27,10 @@ from itertools import count
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 
 from msg_adapters.checks import require_length
-from msg_adapters.errors import InputCode, RejectedInputError
 from msg_adapters.key_values import KeyValueReader, Value, key_values
 from msg_adapters.report import (
     AttemptFigures,
+    BestEffortFigures,
     CertificateFigures,
     CheckFigures,
     NodeCode,
@@ -38,7 +39,6 @@ from msg_adapters.report import (
 )
 from msg_adapters.stamps import (
     nanoseconds_from_stamp,
-    nanoseconds_from_stamp_text,
     stamp_from_nanoseconds,
     stamp_text,
 )
@@ -50,6 +50,8 @@ _CERTIFICATE = "certificate."
 _PASSED = "certificate.passed"
 _REASON = "certificate.reason."
 _CHECK = "certificate.check."
+_VIOLATION = "best_effort.violation."
+_STEP = "best_effort.step."
 _NUMBERS = (
     "solve_time_ms",
     "solver_time_ms",
@@ -124,6 +126,11 @@ def _pairs(report: PlanReport) -> Iterator[tuple[str, Value]]:
         yield "terminal_time_reason", report.attempt.terminal_time_reason
     if report.certificate is not None:
         yield from _certificate_pairs(report.certificate)
+    if report.best_effort is not None:
+        for k, violation in enumerate(report.best_effort.violations):
+            yield f"{_VIOLATION}{k}", violation
+        for k, step in enumerate(report.best_effort.steps):
+            yield f"{_STEP}{k}", step
     if report.rejection is not None:
         yield "field", report.rejection.field
         yield "value", report.rejection.value
@@ -167,7 +174,7 @@ def report_from_message(message: DiagnosticArray) -> PlanReport:
         published=reader.boolean("published"),
         drops=reader.integer("drops"),
         rejected=reader.integer("rejected"),
-        input_stamp_ns=_input_stamp_ns(reader),
+        input_stamp_ns=reader.optional_stamp_ns("input_stamp"),
         latency_ms=reader.optional_number("latency_ms"),
         mass_source=reader.optional_text("mass_source"),
         parameter_set=reader.optional_text("parameter_set"),
@@ -175,19 +182,8 @@ def report_from_message(message: DiagnosticArray) -> PlanReport:
         attempt=_attempt(reader),
         certificate=_certificate(reader),
         rejection=_rejection(reader),
+        best_effort=_best_effort(reader),
     )
-
-
-def _input_stamp_ns(reader: KeyValueReader) -> int | None:
-    text = reader.optional_text("input_stamp")
-    if text is None:
-        return None
-    try:
-        return nanoseconds_from_stamp_text(text)
-    except ValueError:
-        raise RejectedInputError(
-            InputCode.REPORT_BAD_VALUE, "input_stamp", text, "SECONDS.NANOSECONDS"
-        ) from None
 
 
 def _named_numbers(reader: KeyValueReader, prefix: str, keys: Iterable[str]) -> dict[str, float]:
@@ -219,12 +215,9 @@ def _attempt(reader: KeyValueReader) -> AttemptFigures | None:
 def _certificate(reader: KeyValueReader) -> CertificateFigures | None:
     if reader.optional_text(_PASSED) is None:
         return None
-    reasons: list[str] = []
-    while (reason := reader.optional_text(f"{_REASON}{len(reasons)}")) is not None:
-        reasons.append(reason)
     return CertificateFigures(
         passed=reader.boolean(_PASSED),
-        reasons=tuple(reasons),
+        reasons=_listed(reader, _REASON),
         values=_named_numbers(
             reader,
             _CERTIFICATE,
@@ -232,6 +225,19 @@ def _certificate(reader: KeyValueReader) -> CertificateFigures | None:
         ),
         checks=tuple(_checks(reader)),
     )
+
+
+def _listed(reader: KeyValueReader, prefix: str) -> tuple[str, ...]:
+    """Texts of the keys that are numbered from 0."""
+    texts: list[str] = []
+    while (text := reader.optional_text(f"{prefix}{len(texts)}")) is not None:
+        texts.append(text)
+    return tuple(texts)
+
+
+def _best_effort(reader: KeyValueReader) -> BestEffortFigures | None:
+    violations, steps = _listed(reader, _VIOLATION), _listed(reader, _STEP)
+    return BestEffortFigures(violations, steps) if violations or steps else None
 
 
 def _is_of_certificate_itself(key: str) -> bool:

@@ -121,7 +121,7 @@ class Planner:
         self._verifier = PlanVerifier(self.problem, settings.intervals, hold=settings.hold)
         self._verifier.require_checkable(self.parameters)
         self._time = self.problem.table.slice(TERMINAL_TIME)
-        self._time_bounds = self._bounds_of_time()
+        self.time_bounds_s = self._bounds_of_time()
         self._fallback: Fallback | None = None
         if settings.best_effort:
             self._fallback = Fallback(self._loop(free=True), self._verifier)
@@ -278,7 +278,7 @@ class Planner:
         """
         declared = self.problem.table[TERMINAL_TIME]
         seconds = float(declared.validate(predictor.predict(state))[0])
-        low, high = self._time_bounds
+        low, high = self.time_bounds_s
         if not low <= seconds <= high:
             raise InvalidInputError("predicted terminal time", seconds, f"{low:g} to {high:g} s")
         return seconds

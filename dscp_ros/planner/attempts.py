@@ -7,18 +7,20 @@ import time
 import traceback
 from collections.abc import Callable, Collection
 from concurrent.futures import Future
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-from dscp_core.planning.plan import PlanOutcome, PlanStatus
+from dscp_core.planning.plan import BestEffort, PlanOutcome, PlanStatus
 from dscp_core.problem.trajectory import Plan
 from dscp_ros.planner.health import HealthMonitor
 from dscp_ros.planner.input_checks import AcceptedState
 from dscp_ros.planner.outputs import PlanOutputs
 from dscp_ros.planner.parameters import NodeSettings
 from dscp_ros.planner.session import PlanningSession
+from dscp_ros.planner.validity import ValidityKeeper
 from msg_adapters.drawing import Drawing
 from msg_adapters.layout import StateLayout
 from msg_adapters.report import (
+    BestEffortFigures,
     NodeCode,
     PlanReport,
     attempt_from_outcome,
@@ -72,6 +74,7 @@ class AttemptRunner:
         session: PlanningSession,
         outputs: PlanOutputs,
         health: HealthMonitor,
+        validity: ValidityKeeper,
         layout: StateLayout,
         surroundings: Surroundings,
         misses: Collection[str] = (),
@@ -82,6 +85,7 @@ class AttemptRunner:
             session: The planner.
             outputs: Publishers.
             health: Is told of every attempt.
+            validity: Is told of every plan, and of every attempt without one.
             layout: Names and order of the problem's state.
             surroundings: What else an attempt needs.
             misses: Names of the problem's misses.
@@ -89,6 +93,7 @@ class AttemptRunner:
         self._session = session
         self._outputs = outputs
         self._health = health
+        self._validity = validity
         self._layout = layout
         self._around = surroundings
         self._misses = frozenset(misses)
@@ -121,32 +126,62 @@ class AttemptRunner:
         with self._lock:
             waiters, self._waiters = self._waiters, []
         try:
-            report = self._attempt(job)
+            report, *events = self._attempt(job)
         except Exception as error:  # noqa: BLE001 - the node outlives any error of an attempt
-            report = self._internal_error(job, error)
+            report, events = self._internal_error(job, error), []
         self._health.note_attempt(report)
-        self._outputs.publish_report(report)
+        for told in (report, *events):
+            self._outputs.publish_report(told)
         for waiter in waiters:
             waiter.set_result(report)
 
-    def _attempt(self, job: PlanJob) -> PlanReport:
+    def _attempt(self, job: PlanJob) -> list[PlanReport]:
+        """Report of the attempt, then those of what else came of it."""
         settings = self._around.settings()
         state = job.accepted.state
         outcome = self._session.plan(state, settings.deadline_s)
         code: PlanStatus | NodeCode = outcome.status
         message = outcome.message
-        published = False
+        if outcome.status in (PlanStatus.CERTIFIED, PlanStatus.NOT_CERTIFIED):
+            message = f"{outcome.headline}; {message}"
+        published, effort = False, None
         if job.epoch != self._epoch:
             code, message = NodeCode.SUPERSEDED, f"not published after a reset: {message}"
         elif outcome.status is PlanStatus.CERTIFIED and outcome.plan is not None:
             self._outputs.publish_trajectory(outcome.plan, state.stamp_ns)
+            self._validity.note_trajectory(outcome.plan, state.stamp_ns)
             published = True
+        else:
+            effort = outcome.best_effort
+            if effort is not None:
+                self._outputs.publish_best_effort(effort.plan, state.stamp_ns)
+            self._validity.note_outcome(
+                outcome, state.stamp_ns, self._session.least_time_s, effort is not None
+            )
         latency_ms = 1e3 * (time.perf_counter() - job.arrived_s)
         if published and outcome.plan is not None:
             self._draw(outcome.plan, state.stamp_ns, settings.drawing)
         else:
             self._around.log_warning(int(code), f"no plan: {code.name} ({int(code)}): {message}")
-        return self._report(job, code, message, published, latency_ms, outcome)
+        reports = [self._report(job, code, message, published, latency_ms, outcome)]
+        if effort is not None:
+            reports.append(self._effort_report(reports[0], effort))
+        return reports
+
+    def _effort_report(self, attempt: PlanReport, effort: BestEffort) -> PlanReport:
+        """What the best effort of an attempt is worth; the attempt has its own report."""
+        code = NodeCode.BEST_EFFORT
+        violations = "; ".join(effort.violations)
+        self._around.log_warning(int(code), f"best effort, NOT CERTIFIED: {violations}")
+        return replace(
+            attempt,
+            code=int(code),
+            code_name=code.name,
+            message=f"NOT CERTIFIED, published on ~/best_effort: {violations}",
+            attempt=None,
+            certificate=figures_from_certificate(effort.certificate, self._misses),
+            best_effort=BestEffortFigures(effort.violations, effort.steps),
+        )
 
     def _draw(self, plan: Plan, stamp_ns: int, drawing: Drawing | None) -> None:
         """Publish the drawing; a scene that fails costs the picture, not the plan's report."""

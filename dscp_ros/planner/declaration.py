@@ -54,6 +54,8 @@ class NodeParameter:
         )
         if self.choices:
             descriptor.additional_constraints = f"one of {', '.join(self.choices)}"
+        elif isinstance(self.default, bool):
+            descriptor.additional_constraints = self.type_text
         elif isinstance(self.default, int):
             descriptor.integer_range = [
                 IntegerRange(from_value=int(self.lower), to_value=int(self.upper), step=0)

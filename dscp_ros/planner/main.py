@@ -30,6 +30,8 @@ in   ~/vehicle_state  sensor_msgs/JointState       every state as a named scalar
                                                    velocity (twist in the child frame), and
      ~/mass           geometry_msgs/InertiaStamped the mass that completes them
 out  ~/trajectory     trajectory_msgs/JointTrajectory   certified plans only
+     ~/best_effort    trajectory_msgs/JointTrajectory   violates least; only if asked for
+     ~/validity       diagnostic_msgs/DiagnosticArray   whether the last trajectory still holds
      ~/path           nav_msgs/Path                     of problems that bring drawings
      ~/markers        visualization_msgs/MarkerArray    likewise
      ~/report         diagnostic_msgs/DiagnosticArray   one per attempt or refused input

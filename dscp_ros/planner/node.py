@@ -35,6 +35,7 @@ from dscp_ros.planner.parameter_files import ParameterArguments
 from dscp_ros.planner.parameter_server import FileChange, ParameterServer
 from dscp_ros.planner.parameters import RELIABLE, NodeSettings
 from dscp_ros.planner.session import PlannerSetup, PlanningSession
+from dscp_ros.planner.validity import ValidityKeeper
 from dscp_ros.planner.worker import MailboxWorker
 from msg_adapters.errors import InputCode, RejectedInputError
 from msg_adapters.layout import StateLayout, problem_layout
@@ -42,6 +43,7 @@ from msg_adapters.report import NodeCode, PlanReport
 from msg_adapters.stamps import nanoseconds_from_stamp
 
 _HEALTH_PERIOD_S = 1.0
+_VALIDITY_PERIOD_S = 0.05
 _MASS_DEPTH = 10
 """Masses come seldom and in bursts with states; unlike states, none should be skipped."""
 
@@ -76,6 +78,7 @@ class PlannerNode:
         self._outputs = PlanOutputs(
             node, layout, frame=frame, draws=problem.extras.scene is not None
         )
+        self._validity = ValidityKeeper(self._outputs.publish_validity, self._now_ns)
         self._last: AcceptedState | None = None
         surroundings = Surroundings(
             now_ns=self._now_ns,
@@ -89,6 +92,7 @@ class PlannerNode:
             self._session,
             self._outputs,
             self._health,
+            self._validity,
             layout,
             surroundings,
             [miss.name for miss in problem.end_checks],
@@ -146,6 +150,7 @@ class PlannerNode:
         # Health is told by a steady clock: a simulation that stands still is still alive.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         node.create_timer(_HEALTH_PERIOD_S, self._publish_health, clock=steady)
+        node.create_timer(_VALIDITY_PERIOD_S, self._check_validity, clock=steady)
         threshold = JumpThreshold(
             min_forward=None, min_backward=Duration(nanoseconds=-1), on_clock_change=True
         )
@@ -180,6 +185,7 @@ class PlannerNode:
             self._warn(InputCode.MASS_STALE, "no fresh mass message: using mass_fallback_kg")
         self._last = accepted
         self._health.note_input()
+        self._validity.note_state()
         self._worker.submit(PlanJob(accepted, source, arrived_s, self._runner.epoch))
 
     def _refuse(self, error: RejectedInputError, source: str, header: Header | None) -> None:
@@ -228,7 +234,7 @@ class PlannerNode:
         self, _request: Trigger.Request, response: Trigger.Response
     ) -> Trigger.Response:
         """Forget warm start, stamps and mass."""
-        await self._finished(self._forget())
+        await self._finished(self._forget(NodeCode.RESET, "the node was reset"))
         return _answer(response, True, "warm start, stamps and mass forgotten")
 
     async def _on_reload(
@@ -266,7 +272,7 @@ class PlannerNode:
         """Swap the planner between two attempts, unless a parameter has changed meanwhile."""
         if setup.plans_like(built_of):
             self._session.install(setup, planner)
-            self._outputs.clear_drawing(self._now_ns())
+            self._clear("the parameter files were read again")
         else:
             self._change(setup)
 
@@ -296,9 +302,14 @@ class PlannerNode:
     def _change(self, setup: PlannerSetup) -> bool:
         rebuilt = self._session.change(setup)
         if rebuilt:
-            # A plan with fewer intervals would leave arrows of the old one standing.
-            self._outputs.clear_drawing(self._now_ns())
+            self._clear("the planner was rebuilt with other parameters")
         return rebuilt
+
+    def _clear(self, reason: str) -> None:
+        """Take back the last plan: another planner made it."""
+        self._validity.revoke(NodeCode.RELOADED, reason)
+        # A plan with fewer intervals would leave arrows of the old one standing.
+        self._outputs.clear_drawing(self._now_ns())
 
     def _note_rebuild(self, rebuilt: Future[Any]) -> None:
         if rebuilt.cancelled():
@@ -315,10 +326,10 @@ class PlannerNode:
 
     def _on_clock_jump(self, jump: TimeJump) -> None:
         """Begin anew when the clock was set back, by a simulation's reset or a bag's loop."""
-        self._forget()
         jump_s = jump.delta.nanoseconds / 1e9
         cause = f"jumped by {jump_s:.3f} s" if jump_s else "changed its source"
         message = f"the clock {cause}: warm start, stamps and mass forgotten"
+        self._forget(NodeCode.CLOCK_JUMPED_BACK, message)
         self._node.get_logger().warning(message)
         self._outputs.publish_report(self._event(NodeCode.CLOCK_JUMPED_BACK, message, "clock"))
 
@@ -327,17 +338,22 @@ class PlannerNode:
             code, message, stamp_ns=self._now_ns(), source=source, problem=self._problem
         )
 
-    def _forget(self) -> Future[Any]:
+    def _forget(self, code: NodeCode, reason: str) -> Future[Any]:
         """Forget everything that belongs to the time before now."""
         self._runner.new_epoch()
+        self._validity.revoke(code, reason)
         self._worker.clear()
         self._gate.forget()
         self._last = None
-        return self._worker.call(self._forget_plan)
+        return self._worker.call(lambda: self._forget_plan(code, reason))
 
-    def _forget_plan(self) -> None:
+    def _forget_plan(self, code: NodeCode, reason: str) -> None:
         self._session.forget()
+        self._validity.revoke(code, reason)  # a plan may just have slipped through
         self._outputs.clear_drawing(self._now_ns())
+
+    def _check_validity(self) -> None:
+        self._validity.check_time(self._parameters.settings.silence_max_s)
 
     def _publish_health(self) -> None:
         health = self._health.health(

@@ -16,6 +16,7 @@ from msg_adapters.layout import StateLayout
 from msg_adapters.report import PlanReport
 from msg_adapters.report_message import message_from_report
 from msg_adapters.trajectory import TrajectoryEncoder
+from msg_adapters.validity import Validity, message_from_validity
 
 _REPORT_DEPTH = 50
 """Reports kept for late and slow subscribers: every attempt has its report, in bursts too."""
@@ -51,6 +52,8 @@ class PlanOutputs:
         self._markers = (
             node.create_publisher(MarkerArray, "~/markers", latched(1)) if draws else None
         )
+        self._best_effort = node.create_publisher(JointTrajectory, "~/best_effort", latched(1))
+        self._validity = node.create_publisher(DiagnosticArray, "~/validity", latched(1))
         self._report = node.create_publisher(DiagnosticArray, "~/report", latched(_REPORT_DEPTH))
         self._health = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
 
@@ -60,10 +63,26 @@ class PlanOutputs:
         Raises:
             RejectedInputError: The plan holds NaN; nothing is published.
         """
+        self._trajectory.publish(self._encoded(plan, stamp_ns))
+
+    def publish_best_effort(self, plan: Plan, stamp_ns: int) -> None:
+        """Publish what violates least. Not for several threads at once.
+
+        Raises:
+            RejectedInputError: The plan holds NaN; nothing is published.
+        """
+        self._best_effort.publish(self._encoded(plan, stamp_ns))
+
+    def publish_validity(self, validity: Validity) -> None:
+        """Publish whether the last trajectory may be followed."""
+        message = message_from_validity(validity, node=self._name, problem=self._layout.problem)
+        self._validity.publish(message)
+
+    def _encoded(self, plan: Plan, stamp_ns: int) -> JointTrajectory:
         nodes = len(plan.times_s)
         if self._encoder is None or self._encoder.nodes != nodes:
             self._encoder = TrajectoryEncoder(self._layout, nodes, frame=self._frame)
-        self._trajectory.publish(self._encoder.encode(plan, stamp_ns))
+        return self._encoder.encode(plan, stamp_ns)
 
     def publish_drawing(self, plan: Plan, stamp_ns: int, drawing: Drawing | None) -> None:
         """Publish what people look at, if there is anything.

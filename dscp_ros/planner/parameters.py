@@ -53,6 +53,7 @@ class NodeSettings:
         inputs: What inputs have to satisfy.
         deadline_s: Wall time of one plan.
         state_reliability: Reliability that the state subscriptions ask for.
+        silence_max_s: After this long without a state, the last trajectory is revoked.
         drawing: How plans are drawn; None if not at all.
         log_period_s: Least time between two log lines of the same cause.
     """
@@ -61,6 +62,7 @@ class NodeSettings:
     inputs: InputSettings
     deadline_s: float
     state_reliability: str
+    silence_max_s: float
     drawing: Drawing | None
     log_period_s: float
 
@@ -128,6 +130,7 @@ def node_settings(problem: OptimalControlProblem, values: Mapping[str, Any]) -> 
             terminal_time=TerminalTime(values["terminal_time_source"]),
             hold=ControlHold(values["control_hold"]),
             discretisation=Discretisation(values["discretisation"]),
+            best_effort=values["best_effort"],
             options=ScpOptions(
                 max_iterations=values["max_iterations"],
                 cost_tolerance=values["cost_tolerance"],
@@ -139,6 +142,7 @@ def node_settings(problem: OptimalControlProblem, values: Mapping[str, Any]) -> 
         inputs=input_settings(problem, values, parameters),
         deadline_s=values["deadline_s"],
         state_reliability=values["state_reliability"],
+        silence_max_s=values["silence_max_s"],
         drawing=drawing(problem, values, parameters),
         log_period_s=values["log_period_s"],
     )
@@ -170,6 +174,14 @@ _NODE = (
         "How far a stamp may be ahead of the clock.",
         "s",
         0.0,
+        1e9,
+    ),
+    NodeParameter(
+        "silence_max_s",
+        2.0,
+        "Longest time without an accepted state before ~/validity revokes the last trajectory.",
+        "s",
+        0.01,
         1e9,
     ),
     NodeParameter(
@@ -221,6 +233,11 @@ _PLANNING = (
         Discretisation.PROPAGATED.value,
         "Dynamics of the intervals: those that are flown, or the paper's midpoint rule.",
         choices=tuple(rule.value for rule in Discretisation),
+    ),
+    NodeParameter(
+        "best_effort",
+        False,
+        "Whether to publish on ~/best_effort what violates least where no feasible plan is found.",
     ),
 )
 

@@ -67,6 +67,11 @@ class PlanningSession:
         """Names the parameter sets that plans are made with."""
         return self._setup.parameter_set
 
+    @property
+    def least_time_s(self) -> float:
+        """Shortest terminal time of a plan that is free to choose it."""
+        return self._planner.time_bounds_s[0]
+
     def plan(self, state: StampedState, deadline_s: float) -> PlanOutcome:
         """Plan from a state, warm if an earlier plan covers it."""
         last = self._last

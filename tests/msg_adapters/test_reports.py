@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 import string
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ from msg_adapters.diagnostics import Health, health_from_message, message_from_h
 from msg_adapters.errors import InputCode, RejectedInputError
 from msg_adapters.report import (
     AttemptFigures,
+    BestEffortFigures,
     CertificateFigures,
     CheckFigures,
     NodeCode,
@@ -30,6 +32,7 @@ from msg_adapters.report import (
     rejection_from_error,
 )
 from msg_adapters.report_message import level_of, message_from_report, report_from_message
+from msg_adapters.validity import Validity, message_from_validity, validity_from_message
 
 STAMPS = st.integers(0, 2**31 * 1_000_000_000 - 1)
 TEXT = st.text(string.printable, max_size=20)
@@ -97,6 +100,12 @@ reports = st.builds(
     attempt=st.none() | attempts,
     certificate=st.none() | certificates,
     rejection=st.none() | st.builds(Rejection, field=TEXT, value=TEXT, bound=TEXT),
+    best_effort=st.none()
+    | st.builds(
+        BestEffortFigures,
+        violations=st.lists(TEXT, min_size=1, max_size=3).map(tuple),
+        steps=st.lists(TEXT, max_size=3).map(tuple),
+    ),
 )
 
 
@@ -111,6 +120,68 @@ def encode(report: PlanReport) -> DiagnosticArray:
 @given(reports)
 def test_report_round_trip_is_exact(report):
     assert report_from_message(through_the_wire(encode(report))) == report
+
+
+def test_a_report_of_before_2026_12_is_read():
+    check = CheckFigures("glideslope", 0.1, 1.0, "m", 3.0, True)
+    written = replace(FULL, certificate=CertificateFigures(True, (), {}, (check,)))
+    message = encode(written)
+    new = ("stopped", "cost_to_gain", "cost_unit", "certificate.check.0.margin")
+    kept = [pair for pair in message.status[0].values if pair.key not in new]
+    assert len(kept) == len(message.status[0].values) - len(new)
+    message.status[0].values = kept
+    old = replace(written.attempt, stopped=None, cost_to_gain=None, cost_unit=None)
+    assert report_from_message(message) == replace(written, attempt=old)
+
+
+def test_a_check_has_its_margin():
+    checks = (
+        CheckFigures("kept", 0.25, 1.0, "m", 3.0, True),
+        CheckFigures("broken", 1.5, 1.0, "m", 3.0, False),
+        CheckFigures("unknown", None, 1.0, "m", 3.0, False),
+    )
+    message = encode(replace(FULL, certificate=CertificateFigures(False, (), {}, checks)))
+    pairs = {pair.key: pair.value for pair in message.status[0].values}
+    assert pairs["certificate.check.0.margin"] == "0.75"
+    assert pairs["certificate.check.1.margin"] == "-0.5"
+    assert "certificate.check.2.margin" not in pairs
+
+
+validities = st.builds(
+    Validity,
+    stamp_ns=STAMPS,
+    valid=st.booleans(),
+    code=st.integers(0, 999),
+    code_name=TEXT,
+    reason=TEXT,
+    trajectory_stamp_ns=st.none() | STAMPS,
+    trajectory_end_ns=st.none() | STAMPS,
+    best_effort_stamp_ns=st.none() | STAMPS,
+)
+
+
+@given(validities)
+def test_validity_round_trip_is_exact(validity):
+    message = message_from_validity(validity, node="planner", problem="powered_descent")
+    assert validity_from_message(through_the_wire(message)) == validity
+    level = DiagnosticStatus.OK if validity.valid else DiagnosticStatus.WARN
+    assert message.status[0].level == level
+
+
+@given(validities, STAMPS, STAMPS)
+def test_only_the_trajectory_in_question_is_allowed_in_its_own_time(validity, stamp_ns, now_ns):
+    if validity.allows(stamp_ns, now_ns):
+        assert validity.valid
+        assert stamp_ns == validity.trajectory_stamp_ns
+        assert stamp_ns <= now_ns <= validity.trajectory_end_ns
+
+
+def test_a_validity_without_its_word_is_refused():
+    message = message_from_validity(Validity(0, True, 0, "CERTIFIED", ""), node="n", problem="p")
+    message.status[0].values = [pair for pair in message.status[0].values if pair.key != "valid"]
+    with pytest.raises(RejectedInputError, match="'valid'") as caught:
+        validity_from_message(message)
+    assert caught.value.code is InputCode.REPORT_MISSING_KEY
 
 
 def outcome(**changes) -> PlanOutcome:

@@ -32,6 +32,7 @@ from msg_adapters.layout import StateLayout, problem_layout
 from msg_adapters.report import PlanReport
 from msg_adapters.report_message import report_from_message
 from msg_adapters.state import StampedState
+from msg_adapters.validity import Validity, validity_from_message
 
 ROOT = FilePath(__file__).resolve().parents[2]
 LAYOUT: StateLayout = problem_layout(problems.get("powered_descent"))
@@ -84,6 +85,8 @@ class PlannerClient:
         self.trajectories: list[JointTrajectory] = []
         self.paths: list[Path] = []
         self.markers: list[MarkerArray] = []
+        self.best_efforts: list[JointTrajectory] = []
+        self.validity_messages: list[DiagnosticArray] = []
         self.report_messages: list[DiagnosticArray] = []
         self.diagnostics: list[DiagnosticArray] = []
         for kind, topic, store in (
@@ -91,6 +94,8 @@ class PlannerClient:
             (Path, "/planner/path", self.paths),
             (MarkerArray, "/planner/markers", self.markers),
             (DiagnosticArray, "/planner/report", self.report_messages),
+            (JointTrajectory, "/planner/best_effort", self.best_efforts),
+            (DiagnosticArray, "/planner/validity", self.validity_messages),
         ):
             node.create_subscription(kind, topic, store.append, LATCHED)
         node.create_subscription(DiagnosticArray, "/diagnostics", self.diagnostics.append, 10)
@@ -103,6 +108,16 @@ class PlannerClient:
     def reports(self) -> list[PlanReport]:
         """Reports so far."""
         return [report_from_message(message) for message in list(self.report_messages)]
+
+    @property
+    def validities(self) -> list[Validity]:
+        """What the node has told of its trajectories so far."""
+        return [validity_from_message(message) for message in list(self.validity_messages)]
+
+    def next_validity(self, known: int) -> Validity:
+        """Wait for validity number ``known`` + 1."""
+        assert self._ros.wait_for(lambda: len(self.validity_messages) > known, PLAN_TIMEOUT_S)
+        return self.validities[known]
 
     def wait_until_connected(self, process: subprocess.Popen[str] | None = None) -> None:
         """Wait until the node hears every input and is heard on every output.
