@@ -22,6 +22,7 @@ BENCHMARKS = {
     "training": "terminal-time network: error against wall time, the paper's recipe and ours",
     "prediction": "terminal-time network: time of one prediction, difference to PyTorch",
     "terminal_time_source": "free against predicted terminal times, by iteration limit",
+    "cost_to_gain": "what plans are said to cost above a local optimum, against what they do",
     "sensitivity": "derivatives of one cone program against its solve, and against diffcp",
     "tuning": "how a tuning's gradients scale with the number of states and with the workers",
 }

@@ -150,7 +150,8 @@ def test_a_plan_with_its_files(
     assert plan["headline"].startswith("certified, converged: terminal time 30 s (fixed), cost ")
     assert plan["cost_unit"] == "m^2/s^3"
     assert plan["subproblem_costs"] == {"running": "exact", "terminal": "exact"}
-    assert plan["headline"].endswith(" m^2/s^3")
+    assert " m^2/s^3, at most " in plan["headline"]
+    assert plan["headline"].endswith(" m^2/s^3 to gain")
     assert plan["final_east_m"] == pytest.approx(100.0)
     assert plan["final_veast_m_s"] == pytest.approx(0.0, abs=1e-9)
     assert plan["certificate"]["miss_goal_m"] < 0.5
