@@ -6,7 +6,6 @@ Matplotlib is imported when it is drawn.
 from __future__ import annotations
 
 import math
-import textwrap
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -22,6 +21,7 @@ from dscp_core.planning.panels import (
     draw_limit,
     new_figure,
     verdict,
+    wrapped,
 )
 from dscp_core.problem.declaration import OptimalControlProblem, StagePoint, Where, named
 from dscp_core.problem.trajectory import Plan
@@ -35,7 +35,6 @@ Array = NDArray[np.float64]
 _COLUMNS = 3
 _MOST_PANELS = 24
 _PANEL_INCHES = (4.5, 3.2)
-_LEGEND_INCHES, _LETTERS_PER_INCH = 3.8, 10
 _LONGEST_NAME = 34
 _LEAST_SPAN = 1e-3  # of the scale, from bottom to top of a panel
 
@@ -66,10 +65,7 @@ def plan_figure(
     columns = min(_COLUMNS, len(variables))
     rows = math.ceil(len(variables) / columns)
     width, height = _PANEL_INCHES
-    headline = textwrap.fill(
-        title or _headline(problem, plan, certificate),
-        int((columns * width - _LEGEND_INCHES) * _LETTERS_PER_INCH),
-    )
+    headline = wrapped(title or _headline(problem, plan, certificate), columns * width)
     lines = headline.count("\n")
     size = (columns * width, rows * height + 0.8 + 0.2 * lines)
     figure = new_figure(size, headline)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,6 +18,8 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
+_LEGEND_INCHES, _LETTERS_PER_INCH = 3.8, 10
+
 PLANNED = "#c2410c"
 FLOWN = "#1d4ed8"
 LIMIT = "#6b7280"
@@ -30,10 +33,16 @@ PLANNED_STYLE: dict[str, Any] = {
 }
 
 
+def wrapped(headline: str, width_inches: float) -> str:
+    """A headline in lines that leave the legend beside them its place."""
+    return textwrap.fill(headline, int((width_inches - _LEGEND_INCHES) * _LETTERS_PER_INCH))
+
+
 def new_figure(size_inches: tuple[float, float], headline: str) -> Figure:
     """An empty figure under a headline."""
     from matplotlib.figure import Figure
 
+    headline = wrapped(headline, size_inches[0])
     figure = Figure(figsize=size_inches, dpi=120, layout="constrained")
     figure.suptitle(headline, fontsize=13, x=0.01, ha="left")
     return figure
