@@ -140,7 +140,8 @@ def case_planner(
     """
     from dscp_core.planning.planner import Planner
 
-    return Planner(*case_settings(args, options))
+    problem, settings = case_settings(args, options)
+    return Planner(problem, settings, best_effort=best_effort)
 
 
 def case_settings(
@@ -171,7 +172,6 @@ def case_settings(
         intervals=intervals,
         terminal_time=TerminalTime.FREE if free else TerminalTime.FIXED,
         hold=args.hold,
-        best_effort=best_effort,
         discretisation=args.discretisation,
         options=options,
     )

@@ -122,6 +122,8 @@ def _leg(
     )
     if not result.success:
         raise RuntimeError(result.message)
+    assert result.t_events is not None
+    assert result.sol is not None
     times = np.linspace(0.0, float(result.t[-1]), _POINTS + 1)
     when = float(result.t_events[0][0]) if result.t_events[0].size else None
     return result.y[:, -1], when, (times, result.sol(times).T)
