@@ -13,6 +13,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from dscp_core.errors import InvalidInputError
 from dscp_core.planning.certificate import PlanCertificate
 from dscp_core.planning.panels import (
     PLANNED,
@@ -23,6 +24,7 @@ from dscp_core.planning.panels import (
     verdict,
     wrapped,
 )
+from dscp_core.planning.plan import PlanOutcome
 from dscp_core.problem.declaration import OptimalControlProblem, StagePoint, Where, named
 from dscp_core.problem.trajectory import Plan
 
@@ -37,6 +39,22 @@ _MOST_PANELS = 24
 _PANEL_INCHES = (4.5, 3.2)
 _LONGEST_NAME = 34
 _LEAST_SPAN = 1e-3  # of the scale, from bottom to top of a panel
+
+
+def outcome_figure(
+    problem: OptimalControlProblem, outcome: PlanOutcome, title: str | None
+) -> Figure:
+    """The plan of an outcome, or its best effort; see `Planner.figure`."""
+    effort, name = outcome.best_effort, problem.name.replace("_", " ")
+    if effort is not None:
+        plan, certificate = effort.plan, effort.certificate
+        title = title or f"{name}: best effort, NOT CERTIFIED: {effort.violations[0]}"
+    elif outcome.plan is not None and outcome.certificate is not None:
+        plan, certificate = outcome.plan, outcome.certificate
+        title = f"{name}: {outcome.headline}" if title is None else title
+    else:
+        raise InvalidInputError("outcome", outcome.headline, "one with a plan")
+    return plan_figure(problem, plan, certificate, outcome.parameters, title)
 
 
 def plan_figure(

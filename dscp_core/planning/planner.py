@@ -374,21 +374,9 @@ class Planner:
         Raises:
             InvalidInputError: There is no plan.
         """
-        from dscp_core.planning.histories import plan_figure
+        from dscp_core.planning.histories import outcome_figure
 
-        effort, name = outcome.best_effort, self.problem.name.replace("_", " ")
-        if effort is not None:
-            title = title or f"{name}: best effort, NOT CERTIFIED: {effort.violations[0]}"
-            return plan_figure(
-                self.problem, effort.plan, effort.certificate, outcome.parameters, title
-            )
-        if outcome.plan is None or outcome.certificate is None:
-            raise InvalidInputError("outcome", outcome.headline, "one with a plan")
-        if title is None:
-            title = f"{name}: {outcome.headline}"
-        return plan_figure(
-            self.problem, outcome.plan, outcome.certificate, outcome.parameters, title
-        )
+        return outcome_figure(self.problem, outcome, title)
 
     def least_terminal_time(self, state: Array) -> float | None:
         """Least feasible terminal time of a state in seconds, or None when none was found.

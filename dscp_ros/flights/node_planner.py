@@ -200,6 +200,7 @@ class NodePlanner(Planner):
         elapsed_s: float = 0.0,
     ) -> PlanOutcome:
         """See `Planner.plan`; the node has its own deadline and its own warm start."""
+        started_s = time.perf_counter()
         state = self.initial_state if state is None else np.asarray(state, dtype=np.float64)
         source = self.settings.terminal_time
         attempt = Attempt(self.problem, self._verifier, time.perf_counter, deadline_s)
