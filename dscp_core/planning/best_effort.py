@@ -112,7 +112,7 @@ class LeastViolation:
             polish=False,
             cost_tolerance=max(like.cost_tolerance, _COST_TOLERANCE),
         )
-        self.scp = Scp(transcription, options)
+        self.scp = Scp(transcription, options, like.clock)
         self.layout = transcription.layout
         problem = relaxation.problem
         self.nx, self.nu = len(problem.states), len(problem.controls)
