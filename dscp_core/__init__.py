@@ -8,7 +8,7 @@ Example:
     >>> planner = Planner(problems.get("powered_descent"), parameters={"terminal_time": 33.0})
     >>> outcome = planner.plan()
     >>> outcome.headline
-    'certified, converged: terminal time 33 s (fixed), cost -31759.09 kg,
+    'certified, converged: terminal time 33 s (fixed), cost -31759.15 kg,
     at most 0... kg to gain'
     >>> gradient = planner.gradient("cost", at=outcome)
     >>> round(gradient["specific_impulse"], 2), gradient.trusted

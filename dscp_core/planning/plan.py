@@ -67,9 +67,9 @@ class BestEffort:
         steps: What was made least, in this order, each with what it came to.
 
     Example:
-        >>> from dscp_core import Planner, problems
-        >>> Planner(problems.get("powered_descent")).plan().best_effort is None
-        True
+        >>> from dscp_core import BestEffort, Planner, problems
+        >>> isinstance(Planner(problems.get("powered_descent")).plan().best_effort, BestEffort)
+        False
     """
 
     plan: Plan

@@ -61,7 +61,7 @@ class Planner:
         >>> from dscp_core import Planner, problems
         >>> planner = Planner(problems.get("powered_descent"))
         >>> planner.plan().headline
-        'certified, converged: terminal time 32.81 s (fixed), cost -31760.3 kg,
+        'certified, converged: terminal time 32.81 s (fixed), cost -31760.37 kg,
         at most 0... kg to gain'
         >>> planner.state_names
         ('x', 'y', 'z', 'vx', 'vy', 'vz', 'mass')

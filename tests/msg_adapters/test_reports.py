@@ -267,7 +267,12 @@ def test_certificate_becomes_figures():
     assert figures == CertificateFigures(
         False,
         ("glideslope",),
-        {"miss_position_m": 0.5, "miss_speed_m_s": 0.25, "mass_used_kg": 6000.0},
+        {
+            "miss_position_m": 0.5,
+            "miss_speed_m_s": 0.25,
+            "contact_time_s": 32.0,
+            "mass_used_kg": 6000.0,
+        },
         (
             CheckFigures("miss_position", 0.5, 1.0, "m", 32.0, True),
             CheckFigures("miss_speed", 0.25, 0.5, "m/s", 32.0, True),
