@@ -21,7 +21,8 @@ def tracking_thrust(
 ) -> Array:
     """Thrust (3,) in N that follows a plan; it may spend the reserve that the plan keeps.
 
-    The plan's thrust is commanded one lag ahead, as acceleration: the mass is another by now.
+    The plan's thrust is commanded ahead, its size by the engine's lag and its direction by the
+    attitude's, and as acceleration: the mass is another by now.
 
     Args:
         settings: Gains.
@@ -31,8 +32,14 @@ def tracking_thrust(
         bias: (3,) observed acceleration that the model leaves out, m/s^2.
     """
     position, velocity, mass = plan.state(now.time_s)
-    ahead_s = now.time_s + settings.known_lag_s
-    force = plan.thrust(ahead_s, settings.tick_s) * (now.mass / mass)
+    size, pointing = (
+        plan.thrust(now.time_s + ahead_s, settings.tick_s)
+        for ahead_s in (settings.known_lag_s, settings.known_attitude_response_s)
+    )
+    if now.time_s + settings.known_attitude_response_s >= plan.end_s:
+        pointing = np.array([float(np.linalg.norm(size)), 0.0, 0.0])  # upright from the gate on
+    share = float(np.linalg.norm(size) / np.linalg.norm(pointing))
+    force = pointing * (share * now.mass / mass)
     correction = (
         settings.tracking_position_gain * (position - now.position)
         + settings.tracking_velocity_gain * (velocity - now.velocity)
