@@ -38,7 +38,9 @@ _ITERATIONS, _OF_COST = 40, 15
 """Most of one step, and of the last, without which only some of the cost is lost."""
 _PATIENCE = 15
 """Iterations after which the curvature's least factor is raised."""
-_RAISED = 4.0
+_RAISED, _DAMPED = 4.0, 30.0
+"""By this; and after a failure by that."""
+_FAILURES = 3
 _RELATIVE_TOLERANCE = 1e-3
 """Of an error: what later steps may add to it."""
 _COST_TOLERANCE = 1e-6
@@ -258,44 +260,37 @@ class _Search:
             price_name(name): float(numeric(f"price of {name}", table, price, packed))
             for name, price in concessions.softened.items()
         }
-        self._converged: list[bool] = []
-        self._times_s: list[float] = []
+        self._done: list[tuple[bool, float]] = []  # converged, and terminal time, of each step
 
     def from_(self, reference: Array | None) -> Reached | None:
-        """What the steps come to; None where the first leads nowhere, or to less than the best."""
-        owner = self._owner
+        """What the steps come to; None where the first leads nowhere, or to no more than the best.
+
+        A step that fails, or does not converge, leaves what the one before came to.
+        """
         reached: Reached | None = None
         curvature = 1.0
-        shortfalls = owner.relaxation.concessions.shortfalls
+        shortfalls = self._owner.relaxation.concessions.shortfalls
         for index, shortfall in enumerate((*shortfalls, None)):
-            most = _OF_COST if shortfall is None else _ITERATIONS
-            step: tuple[Array, bool, float] | None = None
             for factor in _OWN if index + 1 < len(shortfalls) else (1.0,):
                 # Of what costs the same, what is nearest to the errors that come later.
-                priced = {
+                prices = {
                     price_name(s.name): self._prices[price_name(s.name)] * (1.0 if n else factor)
                     for n, s in enumerate(shortfalls[index:])
                 }
-                changes = {**self._changes, **priced}
-                step = self._step(changes, reference, curvature, most)
-                if step is None:
-                    break
-                reference, _, curvature = step
-            if step is None:
-                return reached
-            reference, converged, curvature = step
-            if not converged and reached is not None:
-                return reached  # the step before was good
-            self._converged.append(converged)
-            self._times_s.append(_seconds(owner.layout, reference))
-            reached = self._reached(reference)
-            if shortfall is None:
-                break
-            error = reached.errors[index]
-            if self._leads_no_further(index, reached):
-                return None
-            bound = (1.0 + _RELATIVE_TOLERANCE) * error + shortfall.tolerance
-            self._changes[bound_name(shortfall.name)] = bound
+                most = _OF_COST if shortfall is None else _ITERATIONS
+                step = self._step({**self._changes, **prices}, reference, curvature, most)
+                if step is None or not (step[1] or reached is None):
+                    return reached
+                reference, converged, curvature = step
+                done = [*self._done, (converged, _seconds(self._owner.layout, reference))]
+                now = self._reached(reference, done)
+                if shortfall is not None and self._leads_no_further(index, now):
+                    return None
+            reached, self._done = now, done
+            if shortfall is not None:
+                error = now.errors[index]
+                bound = (1.0 + _RELATIVE_TOLERANCE) * error + shortfall.tolerance
+                self._changes[bound_name(shortfall.name)] = bound
         return reached
 
     def _leads_no_further(self, index: int, reached: Reached) -> bool:
@@ -312,7 +307,7 @@ class _Search:
         self, changes: dict[str, Any], reference: Array | None, curvature: float, most: int
     ) -> tuple[Array, bool, float] | None:
         """Iterate; the reference after the last iteration, and whether it converged."""
-        owner, least, failures = self._owner, 1.0, 0
+        owner, least, failures, before = self._owner, 1.0, 0, reference
         for number in range(most):
             left = self._left_s()
             if left == 0.0:
@@ -326,11 +321,14 @@ class _Search:
             self._count(result)
             if not result.iterations:
                 failures += 1
-                if failures > 2 or result.status is ScpStatus.SUBPROBLEM_INFEASIBLE:
+                infeasible = result.status is ScpStatus.SUBPROBLEM_INFEASIBLE
+                if failures > _FAILURES or (infeasible and number == 0):
                     return None
-                least *= 30.0
+                if infeasible:  # the last iteration led too far
+                    reference = before
+                least *= _DAMPED
                 continue
-            reference = result.final_reference
+            before, reference = reference, result.final_reference
             if result.status is ScpStatus.CONVERGED:
                 return reference, True, curvature
             if (number + 1) % _PATIENCE == 0:
@@ -338,14 +336,14 @@ class _Search:
             curvature = owner.curvature(result.iterations[-1], parameters)
         return None if reference is None else (reference, False, curvature)
 
-    def _reached(self, reference: Array) -> Reached:
+    def _reached(self, reference: Array, done: list[tuple[bool, float]]) -> Reached:
         owner, layout = self._owner, self._owner.layout
         softened = owner.relaxation.concessions.softened
         free = {**self._changes, **dict.fromkeys(self._prices, 0.0)}
         free |= {price_name(name): 0.0 for name in softened}
         parameters = owner.relaxation.pack(self._packed, free)
         transcription = owner.scp.transcription
-        if transcription.discretisation is Discretisation.PROPAGATED and self._converged[-1]:
+        if transcription.discretisation is Discretisation.PROPAGATED and done[-1][0]:
             reference = restored(transcription, reference, parameters)
         states, controls = layout.states(reference), layout.controls(reference)
         own = states[:, : owner.nx]
@@ -360,6 +358,6 @@ class _Search:
             errors=owner.errors(own[-1], self._packed),
             violations={name: max(slacks[slack_name(name)], 0.0) for name in softened},
             cost=transcription.evaluate(reference, parameters).cost,
-            converged=tuple(self._converged),
-            times_s=tuple(self._times_s),
+            converged=tuple(converged for converged, _ in done),
+            times_s=tuple(seconds for _, seconds in done),
         )

@@ -282,3 +282,41 @@ def test_needs_neither_ros_nor_torch_nor_matplotlib() -> None:
     )
     assert result.returncode == ExitCode.OK, result.stderr
     assert result.stdout.splitlines()[-1] == "imported:"
+
+
+def test_best_effort_is_told_and_never_called_certified(plan: Any) -> None:
+    code, answer = plan("--set", "initial_velocity=-400,30,-30", "--best-effort")
+    assert code == ExitCode.NO_PLAN
+    assert (answer["status"], answer["certified"]) == ("infeasible", False)
+    effort = answer["best_effort"]
+    assert effort["certified"] is False
+    assert effort["certificate"]["passed"] is False
+    # Independent: 146.12 m/s is the least (CasADi + IPOPT, the midpoint rule).
+    speed = sum(effort[f"final_v{axis}_m_s"] ** 2 for axis in "xyz") ** 0.5
+    assert speed == pytest.approx(146.12, rel=2e-3)
+    assert effort["violations"][0] == f"final_speed_error {speed:.4g} m/s"
+    assert [step.split()[0] for step in effort["steps"]][-1] == "cost"
+    assert any(line.startswith("terminal_time ") for line in effort["violations"])
+
+
+def test_best_effort_is_printed_drawn_and_written(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    figure, table = tmp_path / "least.png", tmp_path / "least.csv"
+    case = ["plan", "powered_descent", "--set", "initial_velocity=-400,30,-30"]
+    case += ["--free-terminal-time", "--best-effort"]
+    code = main([*case, "--plot", str(figure), "--output", str(table)])
+    assert code == ExitCode.NO_PLAN
+    out = capsys.readouterr().out
+    assert "best effort, NOT CERTIFIED: terminal time 17.9" in out
+    assert out.index("it violates") < out.index("final_speed_error 146") < out.index("made least")
+    assert figure.read_bytes().startswith(PNG_SIGNATURE)
+    rows = list(csv.reader(table.open(encoding="utf-8")))
+    assert len(rows) == 52
+    assert abs(float(rows[-1][rows[0].index("x_m")])) < 1e-3
+
+
+def test_a_certified_plan_comes_without_a_best_effort(plan: Any) -> None:
+    code, answer = plan("--best-effort")
+    assert code == ExitCode.OK
+    assert answer["best_effort"] is None
