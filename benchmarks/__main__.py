@@ -19,6 +19,7 @@ BENCHMARKS = {
     "entry": "entry: overhead, backward against forward, growth with the number of intervals",
     "certificates": "random landings near their bounds against an independent flight; their cost",
     "latency": "state in to trajectory out: planner, and node over ROS topics with its memory",
+    "best_effort": "best efforts of random infeasible landings against IPOPT, and their time",
     "training": "terminal-time network: error against wall time, the paper's recipe and ours",
     "prediction": "terminal-time network: time of one prediction, difference to PyTorch",
     "terminal_time_source": "free against predicted terminal times, by iteration limit",

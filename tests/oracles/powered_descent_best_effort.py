@@ -120,7 +120,11 @@ class LeastErrorDescent:
             "fuel": -x[6, -1],
         }
         bounds = ca.vertcat(speed_bound, position_bound)
-        options = {"ipopt": _IPOPT, "print_time": False, "error_on_fail": False}
+        options: dict[str, Any] = {
+            "ipopt": _IPOPT,
+            "print_time": False,
+            "error_on_fail": False,
+        }
         self._solvers = {
             name: ca.nlpsol(name, "ipopt", {"x": z, "p": bounds, "f": f + rough, "g": g}, options)
             for name, f in costs.items()
