@@ -3,6 +3,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from itertools import pairwise
 from typing import Any
 
@@ -291,6 +292,25 @@ def test_deadline_counts_for_it_too() -> None:
     assert hurried.best_effort is None
     assert hurried.message.endswith("no best effort: deadline")
     assert whole.iterations > hurried.iterations
+
+
+def test_whatever_the_time_the_steps_that_were_made_come_out() -> None:
+    planner = planner_of(CASES["too low"])
+    assert planner._fallback is not None
+    packed = planner.check_state(planner.initial_state)
+    starts = [(5.6, None)]
+    made = []
+    for calls in range(0, 16, 2):
+        left = iter([1.0] * calls)
+        reached = planner._fallback.least.find(
+            packed, starts, partial(next, left, 0.0), lambda _: None
+        )
+        made.append(0 if reached is None else len(reached.converged))
+    assert made[0] == 0
+    assert made == sorted(made)
+    assert set(made) == {0, 1, 2, 3}
+    cut = planner._fallback._steps(replace(reached, converged=reached.converged[:2]))
+    assert cut[-1].endswith("(not made least: no time left, or no convergence)")
 
 
 def test_a_problem_that_concedes_nothing_refuses() -> None:
