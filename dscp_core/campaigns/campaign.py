@@ -6,7 +6,7 @@ import hashlib
 import json
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -145,7 +145,9 @@ def identity(campaign: Campaign, simulation: Simulation) -> dict[str, Any]:
     flat: dict[str, Any] = {"problem": problem.name, "formulation": problem.formulation}
     if campaign.planner is not None:
         flat["planned_by"] = type(campaign.planner).__name__
-    _flatten(flat, "", settings_document(simulation.settings))
+    how = {f.name: getattr(campaign.settings, f.name) for f in fields(campaign.settings)}
+    del how["parameters"]  # the simulation has every parameter's value
+    _flatten(flat, "", settings_document({**simulation.settings, "planner": how}))
     return {**flat, "code": code_version()}
 
 

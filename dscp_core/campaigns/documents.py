@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, fields, is_dataclass
+from enum import Enum
 from typing import Any
 
 from dscp_core.campaigns.statistics import (
@@ -19,6 +20,10 @@ from dscp_core.problem.simulation import FlightRecord, FlightSummary, Simulation
 
 def settings_document(settings: Any) -> Any:
     """Nested settings as JSON; what is infinite or no number, as text."""
+    if is_dataclass(settings) and not isinstance(settings, type):
+        return settings_document({f.name: getattr(settings, f.name) for f in fields(settings)})
+    if isinstance(settings, Enum):
+        return settings.value
     if isinstance(settings, Mapping):
         return {str(name): settings_document(value) for name, value in settings.items()}
     if isinstance(settings, list | tuple):

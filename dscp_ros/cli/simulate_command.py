@@ -64,6 +64,13 @@ OPTIONS = ("truth", "guidance", "bounds")
 """What a simulation has options of."""
 
 
+_SINGLE = (
+    *("vehicle", "formulation", "intervals", "hold", "discretisation", "solver"),
+    "dispersions",
+)
+"""Options with one value that a replay needs."""
+
+
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Declares the command."""
     parser = subparsers.add_parser(
@@ -203,7 +210,7 @@ def replay_command(args: argparse.Namespace, seed: int) -> str:
     given = {"set": args.assignments, **{option: getattr(args, option) for option in OPTIONS}}
     for option, values in given.items():
         words += [word for value in values for word in (f"--{option}", value)]
-    for option in ("vehicle", "formulation", "intervals", "solver", "dispersions"):
+    for option in _SINGLE:
         if getattr(args, option) is not None:
             words += [f"--{option}", str(getattr(args, option))]
     if args.over_ros:

@@ -288,6 +288,7 @@ def node_planner(
         "intervals": settings.intervals,
         "terminal_time_source": settings.terminal_time.value,
         "certificate_hold": settings.hold.value,
+        "discretisation": settings.discretisation.value,
         "solver": settings.options.solver,
         "deadline_s": 10.0,
         "state_max_age_s": 1e6,

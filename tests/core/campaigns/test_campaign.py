@@ -103,6 +103,9 @@ def test_another_setup_is_refused_by_name(tmp_path: Path) -> None:
     other = Campaign(rolling_cart(), PlannerSettings(parameters={"mass": 2.0}, intervals=5))
     with pytest.raises(GridFileError, match=r"vehicle\.mass 1\.5 there, 2\.0 here"):
         run_campaign(path, other, seeds_of(1, 2))
+    coarse = Campaign(rolling_cart(), PlannerSettings(intervals=6))
+    with pytest.raises(GridFileError, match=r"planner\.intervals 5 there, 6 here"):
+        run_campaign(path, coarse, seeds_of(1, 2))
     assert path.read_bytes() == content
     assert flown(path, 4).kept == 2, "more flights of the same setup are flown on top"
 
