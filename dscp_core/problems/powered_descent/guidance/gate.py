@@ -84,7 +84,6 @@ class GatePlanning:
         reserve = self._reserve(expected.time_s) * self._level * self._released
         vehicle, kept = self._vehicle, self.kept
         least = vehicle.thrust_min_n * (1.0 + self._settings.floor_reserve)
-        gate = vehicle.pad_m + np.array([self._settings.gate_altitude_m, 0.0, 0.0])
         descent = [-self._settings.gate_descent_m_s, 0.0, 0.0]
         self._asked = PlanRequest(
             made_at_s=time_s,
@@ -93,7 +92,7 @@ class GatePlanning:
             parameters={
                 "thrust_max": max((1.0 - reserve) * vehicle.thrust_max_n, least),
                 "thrust_min": least,
-                "final_position": gate,
+                "gate_height": self._settings.gate_altitude_m,
                 "final_velocity": descent,
             },
             warm_start=None if kept is None else kept.plan,

@@ -44,7 +44,7 @@ def ask(planning: GatePlanning, time_s: float) -> PlanRequest:
 def test_a_plan_is_asked_for_to_the_gate_with_a_reserve(planning: GatePlanning) -> None:
     request = ask(planning, 0.0)
     assert request.start_s == pytest.approx(0.12)  # the tick after it came, and the latency
-    assert request.parameters["final_position"] == pytest.approx([6.0, 0.0, 0.0])
+    assert request.parameters["gate_height"] == pytest.approx(6.0)
     assert request.parameters["final_velocity"] == pytest.approx([-6.86, 0.0, 0.0], abs=0.01)
     assert request.parameters["thrust_max"] == pytest.approx(0.92 * 845.2e3)
 
