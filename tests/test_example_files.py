@@ -62,6 +62,7 @@ def check_against_ipopt(problem: OptimalControlProblem, outcome: PlanOutcome) ->
         plan.controls,
         plan.terminal_time_s,
         free=problem.free_terminal_time,
+        propagated=True,
     )
     assert found.message == "Solve_Succeeded"
     assert outcome.cost == pytest.approx(found.cost, rel=1e-6)

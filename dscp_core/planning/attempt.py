@@ -14,10 +14,9 @@ from dscp_core.errors import InvalidInputError
 from dscp_core.planning.certificate import PlanVerifier
 from dscp_core.planning.plan import PlanOutcome, PlanStatus, TerminalTime
 from dscp_core.problem.declaration import TERMINAL_TIME, OptimalControlProblem
-from dscp_core.problem.flight import Discretisation
 from dscp_core.problem.trajectory import Plan
 from dscp_core.scp.gain import cost_to_gain
-from dscp_core.scp.restoration import restored
+from dscp_core.scp.restoration import flyable
 from dscp_core.scp.scp import Iteration, Scp, ScpResult, ScpStatus
 
 Array = NDArray[np.float64]
@@ -234,7 +233,6 @@ def _chosen(scp: Scp, result: ScpResult) -> Iteration | None:
 def _flyable(scp: Scp, iteration: Iteration, parameters: Array) -> Array:
     """The iterate's trajectory, without its last defects where the dynamics are the flown ones."""
     trajectory = iteration.solution.z[: iteration.reference.size]
-    propagated = scp.transcription.discretisation is Discretisation.PROPAGATED
-    if propagated and scp.satisfies_dynamics(iteration):
-        return restored(scp.transcription, trajectory, parameters)
+    if scp.satisfies_dynamics(iteration):
+        return flyable(scp.transcription, trajectory, parameters)
     return trajectory

@@ -16,6 +16,7 @@ from dscp_core.planning.certificate import PlanVerifier
 from dscp_core.planning.plan import PlanOutcome, TerminalTime
 from dscp_core.problem.flight import ControlHold
 from dscp_core.problem.trajectory import Plan
+from dscp_core.scp.restoration import flyable
 from dscp_core.scp.scp import GRADIENT_TOLERANCE, Scp, ScpResult
 
 # How far the differentiated trajectory may be from the plan's, in units of the states' scales, and
@@ -116,7 +117,9 @@ def _moved(scp: Scp, trace: ScpResult, outcome: PlanOutcome, plan: Plan) -> str 
     """Why what was differentiated is not the plan, where that is so."""
     layout, problem = scp.transcription.layout, scp.transcription.problem
     distance = layout.relative(layout.states(trace.final_reference) - plan.states)
-    cost = trace.iterations[-1].cost
+    transcription, parameters = scp.transcription, trace.parameters
+    flown = flyable(transcription, trace.final_reference, parameters)
+    cost = transcription.evaluate(flown, parameters).cost
     size = max(problem.cost_magnitude or problem.cost_scale, abs(outcome.cost))
     if distance <= _SAME_TRAJECTORY and np.abs(cost - outcome.cost) <= (
         _SAME_COST * scp.cost_tolerance * size

@@ -14,6 +14,7 @@ import scipy.sparse as sp
 import scipy.sparse.linalg
 from numpy.typing import NDArray
 
+from dscp_core.problem.flight import Discretisation
 from dscp_core.transcription.transcription import Transcription
 
 Array = NDArray[np.float64]
@@ -21,6 +22,19 @@ Array = NDArray[np.float64]
 _DEFECT = 1e-12
 """Scaled defect that is rounding."""
 _MOST_STEPS = 3
+
+
+def flyable(transcription: Transcription, reference: Array, parameters: Array) -> Array:
+    """What is flown of a trajectory: its restoration, where its dynamics are those of the flight.
+
+    Args:
+        transcription: See `restored`.
+        reference: Scaled reference vector that nearly satisfies the dynamics.
+        parameters: Packed parameters, SI.
+    """
+    if transcription.discretisation is Discretisation.PROPAGATED:
+        return restored(transcription, reference, parameters)
+    return reference
 
 
 def restored(transcription: Transcription, reference: Array, parameters: Array) -> Array:

@@ -17,6 +17,7 @@ from dscp_core.gradients.run import DifferentiationError, unrolled
 from dscp_core.planning.plan import PlanStatus
 from dscp_core.planning.planner import Planner, PlannerSettings, TerminalTime
 from dscp_core.problem.declaration import TERMINAL_TIME, OptimalControlProblem
+from dscp_core.problem.flight import Discretisation
 from dscp_core.problems.powered_descent import powered_descent
 from dscp_core.scp.scp import ScpOptions, ScpStatus
 from dscp_core.workers.choice import make_engine
@@ -50,7 +51,9 @@ class Sweep:
     start_s: float = 32.0
     stop_s: float = 34.0
     step_s: float = 0.01
-    settings: PlannerSettings = field(default_factory=PlannerSettings)
+    settings: PlannerSettings = field(
+        default_factory=lambda: PlannerSettings(discretisation=Discretisation.MIDPOINT)
+    )
     problem: OptimalControlProblem = field(default_factory=powered_descent)
 
     def __post_init__(self) -> None:

@@ -51,7 +51,7 @@ examples:
   dscp plan powered_descent --free-terminal-time --solver qoco,clarabel
   dscp plan powered_descent --plot plan.png --output plan.csv
   dscp plan powered_descent --set terminal_time=32 --json    (infeasible: exit code 3)
-  dscp plan powered_descent --set initial_velocity=-400,30,-30 --best-effort --plot least.png
+  dscp plan powered_descent --set initial_velocity=-400,30,-30 --best-effort    (exit code 3)
   dscp plan entry --set surface_to_mass_ratio=0.93 --plot entry.png
   dscp plan entry --formulation printed --intervals 200
   dscp plan my_problem.py:QUADROTOR --plot quadrotor.png

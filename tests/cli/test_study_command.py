@@ -91,7 +91,7 @@ def test_trust_region_prints_and_writes(
     monkeypatch.setattr(trust_region_cases, "PAPER_INTERVALS", 13)
     assert main(arguments) == ExitCode.BAD_INPUT
     error = json.loads(capsys.readouterr().out)["error"]
-    assert "intervals differ" in error["message"]
+    assert "intervals 12 there, 13 here" in error["message"]
 
 
 def test_surface_to_mass_prints_and_writes(

@@ -1,4 +1,4 @@
-"""Any declared problem, discretised by the midpoint rule, as one nonlinear program for IPOPT.
+"""Any declared problem, discretised, as one nonlinear program for IPOPT.
 
 Nothing is linearised or convexified, and neither transcription nor SCP has a part in it.
 """
@@ -58,6 +58,7 @@ def solve(
     terminal_time_s: float,
     *,
     free: bool,
+    propagated: bool = False,
 ) -> Optimum:
     """Optimum near a start, of a problem whose path constraints stand at nodes.
 
@@ -68,6 +69,8 @@ def solve(
         controls: (N+1, nu) to start from.
         terminal_time_s: To start from where it is free, else to keep.
         free: Whether it is free, within the declared bounds or else 1/100 to 100 times the start.
+        propagated: Whether intervals are integrated under the mean of their controls, instead of by
+            the midpoint rule.
     """
     assert not problem.cone_constraints
     p = {name: ca.SX(ca.DM(value)) for name, value in values.items()}
@@ -85,7 +88,11 @@ def solve(
     at_nodes, acting = scaled_x * ca.DM(x_scale), scaled_u * ca.DM(u_scale)
     step = time_s / (count - 1)
     means = [(v[:, 1:] + v[:, :-1]) / 2 for v in (at_nodes, acting)]
-    defects = at_nodes[:, 1:] - at_nodes[:, :-1] - step * flow.map(count - 1)(*means)
+    if propagated:
+        fly = _flight(flow, nx, nu).map(count - 1)
+        defects = at_nodes[:, 1:] - fly(at_nodes[:, :-1], means[1], step)
+    else:
+        defects = at_nodes[:, 1:] - at_nodes[:, :-1] - step * flow.map(count - 1)(*means)
     weights = np.ones(count)
     weights[[0, -1]] = 0.5
     cost = step * ca.dot(along.map(count)(at_nodes, acting), ca.DM(weights).T)
@@ -136,3 +143,16 @@ def solve(
         states=found[1 : 1 + nx * count].reshape(count, nx) * x_scale,
         controls=found[1 + nx * count :].reshape(count, nu) * u_scale,
     )
+
+
+def _flight(flow: ca.Function, nx: int, nu: int, steps: int = 6) -> ca.Function:
+    """State after an interval of constant controls, by Kutta's three-eighths rule."""
+    x, u, length = ca.SX.sym("x", nx), ca.SX.sym("u", nu), ca.SX.sym("T")
+    state, step = x, length / steps
+    for _ in range(steps):
+        k1 = flow(state, u)
+        k2 = flow(state + step * k1 / 3, u)
+        k3 = flow(state + step * (k2 - k1 / 3), u)
+        k4 = flow(state + step * (k1 - k2 + k3), u)
+        state = state + step * (k1 + 3 * k2 + 3 * k3 + k4) / 8
+    return ca.Function("flight", [x, u, length], [state])

@@ -1,7 +1,8 @@
 """Fuel-optimal powered descent as one nonlinear program, solved by IPOPT.
 
-The discretisation is the midpoint rule (paper's eq. ch2-disdy) and the constraints are those of
-section 4.1, none of them linearised. The target is the origin at rest.
+The discretisation is the midpoint rule (paper's eq. ch2-disdy), or an integration under the
+interval means of the thrust; the constraints are those of section 4.1, none of them linearised. The
+target is the origin at rest.
 """
 
 from __future__ import annotations
@@ -51,11 +52,13 @@ class NlpOptions:
             only the means; without this bound the thrust may alternate in direction from node to
             node, and its mean then falls below the least thrust.
         tolerance: IPOPT's tolerance for the scaled problem.
+        propagated: Whether to integrate every interval, instead of the midpoint rule.
     """
 
     intervals: int = 50
     bound_mean_thrust: bool = True
     tolerance: float = 1e-12
+    propagated: bool = False
 
 
 class Status(Enum):
@@ -164,6 +167,26 @@ class _Constraints:
         self.upper.append(np.full(values.numel(), upper))
 
 
+def _propagated(states: Any, thrust: Any, step: Any, flow_per_thrust: float, gravity: float) -> Any:
+    """States (7, N) an interval later, the thrust (3, N) being constant.
+
+    Thrust over a linearly falling mass is integrated by Gauss and Legendre's rule on five points.
+    """
+    flow = flow_per_thrust * ca.sqrt(ca.sum1(thrust**2))
+    points, weights = np.polynomial.legendre.leggauss(5)
+    speed_gain, way = 0.0, 0.0
+    for point, weight in zip((points + 1) / 2, weights / 2, strict=True):
+        per_mass = weight * step / (states[6, :] - point * step * flow)
+        speed_gain += per_mass
+        way += per_mass * (1 - point) * step
+    down = ca.repmat(ca.DM([gravity, 0.0, 0.0]), 1, states.shape[1])
+    return ca.vertcat(
+        states[:3, :] + step * states[3:6, :] + ca.repmat(way, 3, 1) * thrust - step**2 / 2 * down,
+        states[3:6, :] + ca.repmat(speed_gain, 3, 1) * thrust - step * down,
+        states[6, :] - step * flow,
+    )
+
+
 @functools.lru_cache(maxsize=32)
 def _build(mode: _Mode, parameters: DescentParameters, options: NlpOptions) -> _Program:
     count = options.intervals
@@ -192,7 +215,12 @@ def _build(mode: _Mode, parameters: DescentParameters, options: NlpOptions) -> _
         math.tan(parameters.glideslope_max_rad),
     )
     constraints = _Constraints()
-    constraints.add(states[:, 1:] - states[:, :-1] - terminal_time / count * rate, 0.0, 0.0)
+    step = terminal_time / count
+    if options.propagated:
+        flown = _propagated(states[:, :-1], mean_thrust, step, flow_per_thrust, gravity)
+        constraints.add(states[:, 1:] - flown, 0.0, 0.0)
+    else:
+        constraints.add(states[:, 1:] - states[:, :-1] - step * rate, 0.0, 0.0)
     constraints.add(ca.sum1(thrust**2), least**2, most**2)
     # The cones are squared, which is smooth; the squares need the sign of the axis component.
     constraints.add(ca.sum1(thrust[1:, :] ** 2) - (pointing * thrust[0, :]) ** 2, -np.inf, 0.0)
