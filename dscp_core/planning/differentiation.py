@@ -49,6 +49,8 @@ class Certifier:
         """Whether the flight passes every check."""
         transcription, z = self._scp.transcription, trace.final_reference
         layout = transcription.layout
+        if trace.iterations and self._scp.satisfies_dynamics(trace.iterations[-1]):
+            z = flyable(transcription, z, trace.parameters)
         seconds = transcription.terminal_time(z, trace.parameters)
         times = np.linspace(0.0, seconds, layout.intervals + 1)
         states, controls = layout.states(z), layout.controls(z)

@@ -14,7 +14,6 @@ from dscp_core.errors import InvalidInputError
 from dscp_core.gradients.differences import RunDifferences, relative_error
 from dscp_core.gradients.losses import FinalStateLoss
 from dscp_core.gradients.run import DifferentiationError, unrolled
-from dscp_core.planning.plan import PlanStatus
 from dscp_core.planning.planner import Planner, PlannerSettings, TerminalTime
 from dscp_core.problem.declaration import TERMINAL_TIME, OptimalControlProblem
 from dscp_core.problem.flight import Discretisation
@@ -205,7 +204,7 @@ def summarise(sweep: Sweep, points: Sequence[SweepPoint]) -> SweepSummary:
     best = max(feasible, key=lambda p: p.final_mass_kg, default=None)
     planner = Planner(sweep.problem, replace(sweep.settings, terminal_time=TerminalTime.FREE))
     free = planner.plan(planner.initial_state)
-    optimum = free.plan if free.status is PlanStatus.CERTIFIED else None
+    optimum = free.plan if free.converged else None
     return SweepSummary(
         points=len(points),
         infeasible_s=(min(infeasible), max(infeasible)) if infeasible else None,

@@ -287,7 +287,7 @@ def node_planner(
         "problem": problem,
         "intervals": settings.intervals,
         "terminal_time_source": settings.terminal_time.value,
-        "certificate_hold": settings.hold.value,
+        "control_hold": settings.hold.value,
         "discretisation": settings.discretisation.value,
         "solver": settings.options.solver,
         "deadline_s": 10.0,
