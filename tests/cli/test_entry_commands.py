@@ -35,7 +35,7 @@ def test_default_is_the_papers_case(capsys: pytest.CaptureFixture[str], tmp_path
     assert "final_mass_kg" not in plan
     assert "mass_used_kg" not in plan["certificate"]
     assert plan["certificate"]["miss_position_m"] < 500.0
-    assert plan["iterations"] <= 6
+    assert plan["iterations"] <= 12
     with table.open(newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == 101
