@@ -320,7 +320,9 @@ class _Run:
         message = f"iteration {number}: {solution.solver}: {solution.status.value}"
         if solution.message:
             message += f" ({solution.message})"
-        if solution.status is SolveStatus.TIME_LIMIT:
+        left = self._remaining()
+        # A solver that runs out of time may call it something else.
+        if solution.status is SolveStatus.TIME_LIMIT or (left is not None and left <= 0.0):
             return self._finish(ScpStatus.DEADLINE, message, solution)
         if solution.status is SolveStatus.INFEASIBLE:
             return self._finish(ScpStatus.SUBPROBLEM_INFEASIBLE, message, solution)

@@ -189,6 +189,19 @@ def test_deadline_keeps_what_is_done(scp: Scp) -> None:
     np.testing.assert_array_equal(result.final_reference, done)
 
 
+@pytest.mark.parametrize(
+    ("deadline_s", "status"), [(3.5, ScpStatus.DEADLINE), (60.0, ScpStatus.SOLVER_FAILURE)]
+)
+def test_a_solver_that_fails_when_the_time_is_over(
+    scp: Scp, deadline_s: float, status: ScpStatus
+) -> None:
+    ticks = iter(range(10**6))
+    settings = SolverSettings(max_iterations=2)
+    options = ScpOptions(deadline_s=deadline_s, solver_settings=settings)
+    failing = Scp(scp.transcription, options, lambda: 1.0 * next(ticks))
+    assert failing.run(packed(scp)).status is status
+
+
 def test_fixed_number_of_iterations(scp: Scp, nominal: ScpResult) -> None:
     for count in (1, 4, len(nominal.iterations) + 2):
         result = scp.with_options(fixed_iterations=count).run(packed(scp))
