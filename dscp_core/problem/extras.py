@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 from dscp_core.problem import checks
+from dscp_core.problem.guidance import Guided
 from dscp_core.problem.messages import Messages
 from dscp_core.problem.scene import SceneOf
 from dscp_core.problem.simulation import Simulated
@@ -53,6 +54,7 @@ class Extras:
         messages: How states and plans are told of in messages.
         scene: Its plans in space; None for none.
         simulation: Its closed-loop flights; None for none.
+        guidance: What guides its vehicle in a node; None for none.
 
     Example:
         >>> from dscp_core import problems
@@ -68,9 +70,10 @@ class Extras:
     messages: Messages = field(default_factory=Messages)
     scene: SceneOf | None = None
     simulation: Simulated | None = None
+    guidance: Guided | None = None
 
     def __post_init__(self) -> None:
-        for name in ("figure", "scene", "simulation"):
+        for name in ("figure", "scene", "simulation", "guidance"):
             if getattr(self, name) is not None:
                 checks.function(f"{name} of extras", getattr(self, name))
         checks.plain("extras", self, Messages=Messages)

@@ -33,6 +33,7 @@ COMMANDS: dict[str, Command] = {
     "tune": Command("dscp_ros.cli.tune_command", "tune parameters on logs"),
     "evaluate": Command("dscp_ros.cli.evaluate_command", "measure a network against brute force"),
     "planner": Command("dscp_ros.cli.planner_command", "run the planner as a ROS 2 node"),
+    "guide": Command("dscp_ros.cli.guide_command", "run guidance as a ROS 2 node"),
     "replay": Command("dscp_ros.cli.replay_command", "publish a bag's messages on ROS 2 topics"),
     "bag": Command("dscp_ros.cli.bag_commands", "look into, check and repair MCAP bags"),
 }

@@ -29,14 +29,13 @@ from dscp_core.errors import DscpError, InvalidInputError
 from dscp_core.planning.attempt import Attempt
 from dscp_core.planning.plan import PlanOutcome, PlanStatus
 from dscp_core.planning.planner import Planner, PlannerSettings
-from dscp_core.problem.declaration import TERMINAL_TIME, OptimalControlProblem
+from dscp_core.problem.declaration import OptimalControlProblem
 from dscp_core.problem.trajectory import Plan
 from dscp_ros.demo.processes import Child, child
-from dscp_ros.planner.declaration import VEHICLE_PREFIX
+from dscp_ros.flights.telling import differing, told_parameters
 from dscp_ros.planner.parameters import parameter_table
 from msg_adapters.joint_state import joint_state_from_state
 from msg_adapters.layout import problem_layout
-from msg_adapters.parameters import parameter_to_message_axes
 from msg_adapters.report import PlanReport
 from msg_adapters.report_message import report_from_message
 from msg_adapters.stamps import nanoseconds_from_seconds, stamp_from_nanoseconds
@@ -238,23 +237,9 @@ class NodePlanner(Planner):
 
         A changed parameter makes the node forget its warm start; what is left of the time is told.
         """
-        changed = {}
         values = self.problem.table.unpack(self.parameters)
-        if warm_start is not None:
-            declared = self.problem.table[TERMINAL_TIME]
-            left_s = warm_start.terminal_time_s - elapsed_s
-            values[TERMINAL_TIME] = float(np.clip(left_s, declared.lower, declared.upper))
-        for name, value in values.items():
-            full = VEHICLE_PREFIX + name
-            if full not in self._link.told:  # of the initial state, which every state sets
-                continue
-            told = (
-                value
-                if isinstance(value, float)
-                else parameter_to_message_axes(self._layout, value.tolist())
-            )
-            if not np.array_equal(told, np.asarray(self._link.told[full], dtype=np.float64)):
-                changed[full] = told
+        wanted = told_parameters(self.problem, self._layout, values, warm_start, elapsed_s)
+        changed = differing(wanted, self._link.told)
         if changed:
             self._link.set(changed)
             self._link.told |= changed

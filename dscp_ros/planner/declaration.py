@@ -33,6 +33,7 @@ class NodeParameter:
         read_only: Whether it can be set at the start only.
         may_be_empty: Whether an empty text is a value.
         infinite: Whether numbers may be infinite: bounds, which are then none.
+        suited: Whether NaN is a value: it stands for what suits the vehicle.
     """
 
     name: str
@@ -45,6 +46,7 @@ class NodeParameter:
     read_only: bool = False
     may_be_empty: bool = False
     infinite: bool = False
+    suited: bool = False
 
     def descriptor(self) -> ParameterDescriptor:
         """Descriptor with range and constraints."""
@@ -60,7 +62,7 @@ class NodeParameter:
             descriptor.integer_range = [
                 IntegerRange(from_value=int(self.lower), to_value=int(self.upper), step=0)
             ]
-        elif isinstance(self.default, float) and not self.infinite:
+        elif isinstance(self.default, float) and not (self.infinite or self.suited):
             largest = sys.float_info.max
             descriptor.floating_point_range = [
                 FloatingPointRange(
@@ -69,7 +71,7 @@ class NodeParameter:
                 )
             ]
         elif not isinstance(self.default, str):
-            # The range of a descriptor has no room for infinity.
+            # The range of a descriptor has no room for infinity and NaN.
             count = 1 if isinstance(self.default, float) else len(self.default)
             descriptor.additional_constraints = (
                 f"{count} number{'s' * (count != 1)} in [{self.lower:g}, {self.upper:g}]"
@@ -99,6 +101,8 @@ class NodeParameter:
                     self.name, components, f"{len(self.default)} numbers, each with a point"
                 )
         for component in components:
+            if math.isnan(component) and self.suited:
+                continue
             if math.isnan(component) or (math.isinf(component) and not self.infinite):
                 raise InvalidInputError(self.name, value, "no NaN" if self.infinite else "finite")
             if not self.lower <= component <= self.upper:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -73,6 +74,7 @@ def node_parameter(declared: Parameter) -> NodeParameter:
         declared.lower,
         declared.upper,
         infinite=declared.infinite,
+        suited=isinstance(default, float) and math.isnan(default),
     )
 
 

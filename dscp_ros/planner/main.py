@@ -8,17 +8,18 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from types import FrameType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 from dscp_core.errors import DscpError, InvalidInputError
 from dscp_ros.cli import ExitCode
 
 if TYPE_CHECKING:
     from rclpy.executors import Executor
+    from rclpy.node import Node
 
-    from dscp_ros.planner.node import PlannerNode
+    from dscp_ros.planner.parameter_files import ParameterArguments
 
 NODE_NAME = "planner"
 
@@ -57,20 +58,41 @@ _STOP_S = 3.0
 """Longest wait for the attempt in hand at the end; launch files send SIGKILL after 5 to 10 s."""
 
 
+class RunningNode(Protocol):
+    """What lives on a node."""
+
+    def close(self, timeout_s: float) -> bool:
+        """End it; whether that took no longer."""
+        ...
+
+    def report_internal_error(self, error: Exception) -> None:
+        """Report an exception that a callback let through."""
+        ...
+
+
+if TYPE_CHECKING:
+    MakeNode = Callable[[Node, ParameterArguments], RunningNode]
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command line."""
+    parser.add_argument(
+        "--problem",
+        metavar="PROBLEM",
+        help="a known name, or FILE.py:NAME for a problem in a Python file, which is run; the same "
+        "as -p problem:=PROBLEM",
+    )
+    add_ros_arguments(parser)
+
+
+def add_ros_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare what is for ROS."""
     parser.add_argument(
         "--params-file",
         metavar="FILE",
         action="append",
         default=[],
         help="ROS parameter file (YAML); may be given several times, later ones win",
-    )
-    parser.add_argument(
-        "--problem",
-        metavar="PROBLEM",
-        help="a known name, or FILE.py:NAME for a problem in a Python file, which is run; the same "
-        "as -p problem:=PROBLEM",
     )
     parser.add_argument(
         "--ros-args",
@@ -115,7 +137,30 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def run(arguments: Sequence[str]) -> int:
-    """Run the node with a ROS command line, as the last thing that a process does.
+    """Run the planner with a ROS command line, as the last thing that a process does.
+
+    Returns:
+        Exit code 0, after SIGINT or SIGTERM.
+
+    Raises:
+        InvalidInputError: Bad arguments or parameters.
+    """
+    return run_node(arguments, NODE_NAME, _planner_node)
+
+
+def _planner_node(node: Node, sources: ParameterArguments) -> RunningNode:
+    from dscp_ros.planner.node import PlannerNode
+
+    return PlannerNode(node, sources)
+
+
+def run_node(arguments: Sequence[str], name: str, make: MakeNode) -> int:
+    """Run a node with a ROS command line, as the last thing that a process does.
+
+    Args:
+        arguments: The command line.
+        name: Name of the node.
+        make: Brings it to life.
 
     Returns:
         Exit code 0, after SIGINT or SIGTERM.
@@ -135,7 +180,7 @@ def run(arguments: Sequence[str]) -> int:
     }
     after: dict[signal.Signals, Any] = previous
     try:
-        code = _run(arguments, stop)
+        code = _run(arguments, stop, name, make)
         # A second Ctrl-C must not turn a clean end into a killed process.
         after = dict.fromkeys(previous, signal.SIG_IGN)
         return code
@@ -144,14 +189,13 @@ def run(arguments: Sequence[str]) -> int:
             signal.signal(number, handler)
 
 
-def _run(arguments: Sequence[str], stop: threading.Event) -> int:
+def _run(arguments: Sequence[str], stop: threading.Event, name: str, make: MakeNode) -> int:
     import rclpy
     from rclpy.executors import SingleThreadedExecutor
     from rclpy.node import Node
     from rclpy.signals import SignalHandlerOptions
     from rclpy.utilities import try_shutdown
 
-    from dscp_ros.planner.node import PlannerNode
     from dscp_ros.planner.parameter_files import check_files, parameter_arguments
 
     sources = parameter_arguments(arguments)
@@ -162,15 +206,15 @@ def _run(arguments: Sequence[str], stop: threading.Event) -> int:
         raise InvalidInputError("ROS arguments", list(arguments), f"rcl: {error}") from None
     try:
         executor = SingleThreadedExecutor()
-        node = Node(NODE_NAME)
-        planner = PlannerNode(node, sources)
+        node = Node(name)
+        running = make(node, sources)
         executor.add_node(node)
         # Otherwise the collector walks all that was imported so far, for milliseconds, again and
         # again while plans are made.
         gc.collect()
         gc.freeze()
-        _spin(executor, planner, stop)
-        if not planner.close(_STOP_S):
+        _spin(executor, running, stop)
+        if not running.close(_STOP_S):
             node.get_logger().warning(f"a plan is left after {_STOP_S:g} s, unfinished")
             # Tearing ROS and Python down under a running solver may crash either.
             os._exit(ExitCode.OK)
@@ -181,7 +225,7 @@ def _run(arguments: Sequence[str], stop: threading.Event) -> int:
     return ExitCode.OK
 
 
-def _spin(executor: Executor, planner: PlannerNode, stop: threading.Event) -> None:
+def _spin(executor: Executor, running: RunningNode, stop: threading.Event) -> None:
     """Serve callbacks until told to stop; an exception in one of them does not end the node."""
     from rclpy.executors import ExternalShutdownException
 
@@ -191,7 +235,7 @@ def _spin(executor: Executor, planner: PlannerNode, stop: threading.Event) -> No
         except ExternalShutdownException:
             return
         except Exception as error:  # noqa: BLE001 - reported; the node lives on
-            planner.report_internal_error(error)
+            running.report_internal_error(error)
 
 
 if __name__ == "__main__":

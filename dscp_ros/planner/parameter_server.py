@@ -17,6 +17,7 @@ from rclpy.parameter import Parameter
 
 from dscp_core.errors import DscpError, InvalidInputError
 from dscp_core.planning.planner import TerminalTime
+from dscp_core.problem.declaration import OptimalControlProblem
 from dscp_ros.planner.choice import ProblemChoice, is_file
 from dscp_ros.planner.declaration import NodeParameter
 from dscp_ros.planner.parameter_files import (
@@ -60,6 +61,14 @@ class _Origin:
     predictors: Predictors
 
 
+Own = Callable[[OptimalControlProblem], Sequence[NodeParameter]]
+"""Parameters that a node has beside the planner's."""
+
+
+def _no_more(_problem: OptimalControlProblem) -> Sequence[NodeParameter]:
+    return ()
+
+
 class ParameterServer:
     """The node's parameters.
 
@@ -69,12 +78,13 @@ class ParameterServer:
         setup: What the planner is made of by these settings; likewise.
     """
 
-    def __init__(self, node: Node, arguments: ParameterArguments) -> None:
+    def __init__(self, node: Node, arguments: ParameterArguments, own: Own = _no_more) -> None:
         """Declare every parameter and read its first value.
 
         Args:
             node: Node to declare them on.
             arguments: Where the node's command line takes parameters from.
+            own: What the node has beside the planner's.
 
         Raises:
             InvalidInputError: A misspelt node or parameter name, or a bad value.
@@ -88,7 +98,7 @@ class ParameterServer:
         self._choice = self._read_choice()
         forms = formulation_parameters(self._choice.family.formulations)
         self.problem = self._choice.make("".join(self._declare(form) for form in forms))
-        for parameter in parameter_table(self.problem):
+        for parameter in (*own(self.problem), *parameter_table(self.problem)):
             self._declare(parameter)
         # rclpy offers no public way to what the command line and files gave; it ignores names
         # that are not declared.
@@ -100,6 +110,11 @@ class ParameterServer:
         self._on_change: Callable[[], None] | None = None
         node.add_on_set_parameters_callback(self._validate)
         node.add_post_set_parameters_callback(self._apply)
+
+    @property
+    def values(self) -> Mapping[str, Any]:
+        """Current values by name."""
+        return self._values()
 
     def on_change(self, callback: Callable[[], None]) -> None:
         """Call back whenever a parameter has changed."""

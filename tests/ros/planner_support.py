@@ -175,10 +175,12 @@ class PlannerClient:
         assert self._ros.wait_for(lambda: bool(predicate()), PLAN_TIMEOUT_S)
 
 
-def start(ros: Harness, arguments: Sequence[str] = ()) -> subprocess.Popen[str]:
+def start(
+    ros: Harness, arguments: Sequence[str] = (), module: str = "dscp_ros.planner.main"
+) -> subprocess.Popen[str]:
     """Start the node's process."""
     return subprocess.Popen(
-        [sys.executable, "-m", "dscp_ros.planner.main", *arguments],
+        [sys.executable, "-m", module, *arguments],
         cwd=ROOT,
         env=ros.child_env(),
         stdout=subprocess.PIPE,

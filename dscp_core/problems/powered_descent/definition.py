@@ -33,6 +33,7 @@ from dscp_core.problems.powered_descent.checks import (
 )
 from dscp_core.problems.powered_descent.figure import descent_figure
 from dscp_core.problems.powered_descent.guess import norm, projected_guess, raw_guess, target
+from dscp_core.problems.powered_descent.guidance.offered import LandingGuidances
 from dscp_core.problems.powered_descent.limits import (
     CONES,
     CONTACT,
@@ -176,6 +177,7 @@ def powered_descent(formulation: Formulation = Formulation.CONVERGENT) -> Optima
             messages=MESSAGES,
             scene=scene_of_settings,
             simulation=DescentSimulations(),
+            guidance=LandingGuidances(),
         ),
     )
     if formulation is Formulation.CONVERGENT:

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from dscp_core.planning.plan import PlanOutcome
 from dscp_core.problem.flight import ControlHold
+from dscp_core.problem.guidance import Answer
 from dscp_core.problem.trajectory import Plan
 from dscp_core.problems.powered_descent.guidance.reference import Reference
 from dscp_core.problems.powered_descent.guidance.settings import GuidanceSettings
@@ -102,7 +102,7 @@ class GatePlanning:
         self._next_s = time_s + self._settings.replan_s
         return self._asked
 
-    def take(self, request: PlanRequest, outcome: PlanOutcome, now_s: float) -> bool:
+    def take(self, request: PlanRequest, outcome: Answer, now_s: float) -> bool:
         """Take an answer, however late; whether its plan is kept.
 
         A plan is flown on from where it would be by now. It is refused if it is not certified, is

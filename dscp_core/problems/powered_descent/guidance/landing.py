@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from dscp_core.planning.plan import PlanOutcome
 from dscp_core.problem.flight import ControlHold
+from dscp_core.problem.guidance import Answer
 from dscp_core.problems.powered_descent.guidance.gate import GatePlanning, PlanRequest
 from dscp_core.problems.powered_descent.guidance.laws import (
     contact_speed_m_s,
@@ -63,6 +63,21 @@ class LandingGuidance:
         self.planning = GatePlanning(settings, self.vehicle, values, hold)
         self.phase = Phase.WAITING
 
+    @property
+    def tick_s(self) -> float:
+        """From one command to the next."""
+        return self.settings.tick_s
+
+    @property
+    def waits(self) -> bool:
+        """Whether there is no plan yet, and nothing to command."""
+        return self.phase is Phase.WAITING
+
+    @property
+    def follows_plan(self) -> bool:
+        """Whether it flies a plan now, and not the profile."""
+        return self.phase is Phase.TRACKING
+
     def measure(self, time_s: float, state: Array) -> None:
         """Take what navigation tells (7,), SI, core axes, of the declared delay ago.
 
@@ -71,7 +86,7 @@ class LandingGuidance:
         """
         self.observer.measure(time_s, state)
 
-    def take_plan(self, request: PlanRequest, outcome: PlanOutcome, now_s: float) -> bool:
+    def take_plan(self, request: PlanRequest, outcome: Answer, now_s: float) -> bool:
         """Take the answer to a request, however late; whether its plan is flown."""
         return self.planning.take(request, outcome, now_s)
 

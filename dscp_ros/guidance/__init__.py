@@ -1,0 +1,1 @@
+"""The guidance node: commands a vehicle along the plans of a planner node."""
