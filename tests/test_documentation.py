@@ -28,6 +28,7 @@ CALL = "import sys; from dscp_ros.cli.main import main; sys.exit(main())"
 # Commands that are only parsed, and why; all others are run.
 PARSED_ONLY = {
     ("planner",): "lives until it is stopped; tests/ros starts it",
+    ("guide",): "lives until it is stopped; tests/ros/test_guidance_node.py",
     ("replay",): "takes as long as the flight, and wants a listener; tests/ros/test_replay.py",
     ("bag", "record"): "lives until it is stopped; tests/ros/test_bag_record.py",
     ("simulate",): "many flights; tests/cli/test_simulate_command.py",

@@ -32,7 +32,7 @@ srv  ~/reset               std_srvs/Trigger                 begin another flight
 
 EPILOG = """\
 examples:
-  dscp planner & dscp guide
+  dscp guide
   dscp guide --params-file landing.yaml --ros-args -r '~/vehicle_state:=/navigation/state'
   dscp guide --ros-args -p guidance.replan_s:=2.0 -p guidance.known_planning_latency_s:=0.2
 

@@ -189,7 +189,10 @@ class GuidanceNode:
 
     def _tick(self) -> None:
         flight, newest, now_ns = self._flight, self._newest, self._now_ns()
-        if flight is None or newest is None or now_ns <= flight.ticked_ns:
+        if flight is None or newest is None or now_ns == flight.ticked_ns:
+            return
+        if now_ns < flight.ticked_ns:  # the system's clock, whose steps nobody is told
+            self._forget("the clock was set back: begins anew with the next state")
             return
         flight.ticked_ns = now_ns
         self._ticks += 1
@@ -221,7 +224,7 @@ class GuidanceNode:
         self._thrust.publish(wrench)
 
     def _ask(self, flight: _Flight, request: Request, time_s: float) -> None:
-        settings = self._parameters.settings
+        inputs = self._parameters.settings.inputs
         table = self._planner.problem.table
         values = table.unpack(table.pack(request.parameters, self._planner.parameters))
         ahead_s = request.start_s - time_s
@@ -229,8 +232,8 @@ class GuidanceNode:
             **told_parameters(
                 self._planner.problem, self._layout, values, request.warm_start, request.elapsed_s
             ),
-            "control_hold": settings.planner.hold.value,
-            "future_tolerance_s": round(ahead_s + settings.inputs.future_tolerance_s, 6),
+            "control_hold": self._planner.settings.hold.value,
+            "future_tolerance_s": round(ahead_s + inputs.future_tolerance_s, 6),
         }
         self._link.ask(request, flight.stamp_ns(request.start_s), wanted)
 

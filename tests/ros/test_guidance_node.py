@@ -45,7 +45,7 @@ START_S = 1000.0
 TICK_S = 0.1
 WAIT_S = 20.0
 SIMULATED = ["--ros-args", "-p", "use_sim_time:=true"]
-PLANNER = [*SIMULATED, "-p", "deadline_s:=15.0", "-p", "terminal_time_source:=free"]
+PLANNER = [*SIMULATED, "-p", "deadline_s:=15.0"]
 OK, WARN = (
     int.from_bytes(level, "little") for level in (DiagnosticStatus.OK, DiagnosticStatus.WARN)
 )
@@ -73,6 +73,7 @@ class Vehicle:
             for name in ("/planner/reset", "/guidance/reset")
         }
         self._node = node
+        self.planner = start(ros, PLANNER)
         self.ticks = 0
 
     @property
@@ -155,15 +156,16 @@ class Vehicle:
 @contextmanager
 def nodes(ros: Harness, *guidance: str) -> Iterator[Vehicle]:
     """A vehicle, with both nodes in processes of their own."""
-    processes = [start(ros, PLANNER)]
-    processes.append(start(ros, [*SIMULATED, *guidance], "dscp_ros.guidance.main"))
+    process = start(ros, [*SIMULATED, *guidance], "dscp_ros.guidance.main")
     try:
         vehicle = Vehicle(ros)
-        vehicle.wait_until_connected()
-        yield vehicle
+        try:
+            vehicle.wait_until_connected()
+            yield vehicle
+        finally:
+            end(vehicle.planner)
     finally:
-        for process in processes:
-            end(process)
+        end(process)
 
 
 @pytest.fixture(autouse=True)
@@ -267,6 +269,18 @@ def test_whatever_comes_it_says_why_it_commands_nothing(ros: Harness) -> None:
         assert tick(2.8, told=False) is None
         assert "the last state is 0.60 s old, more than 0.5 s" in vehicle.status.message
         assert tick(2.9) is not None
+
+        # The planner ends, and another one comes, which was told nothing yet.
+        end(vehicle.planner)
+        tenths = iter(range(30, 100))
+        while "there is no planner node" not in vehicle.status.message:
+            assert tick(0.1 * next(tenths)) is not None
+        assert "flies on the last plan" in vehicle.status.message
+        flown, vehicle.planner = vehicle.status.plans_flown, start(ros, PLANNER)
+        vehicle.wait_until_connected()
+        while vehicle.status.plans_flown == flown:
+            assert tick(0.1 * next(tenths)) is not None
+        assert vehicle.status.level == OK
 
         vehicle.tell_until(START_S - 500.0)
         vehicle.wait_for(lambda: "the clock jumped by" in vehicle.status.message)
