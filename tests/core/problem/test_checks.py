@@ -68,6 +68,7 @@ def test_scales_are_positive_numbers(scale: Any) -> None:
         (lambda: CostTerm("drag", term("t").expression, "node"), "where of cost term drag"),  # type: ignore[arg-type]
         (lambda: Miss("m\tm", lambda x, p: x[0], "m", 1.0), r"name of a miss: got 'm\\tm'"),
         (lambda: Extras(figure=3), "figure of extras: got 3, expected a function"),  # type: ignore[arg-type]
+        (lambda: Extras(guidance=3), "guidance of extras: got 3, expected a function"),  # type: ignore[arg-type]
         (lambda: Extras(messages=3), "messages of extras: got 3, expected of"),  # type: ignore[arg-type]
     ],
 )
