@@ -21,6 +21,9 @@ _RELEASED = (1.0, 0.8, 0.5, 0.0)
 _RECOVERED = 0.05
 """Part of the reserve that the next plan keeps again."""
 
+_ANGLE_MARGIN_RAD = 2e-3
+"""By which the cone of a plan is wider than the line of sight that it begins on."""
+
 
 @dataclass(frozen=True)
 class PlanRequest:
@@ -56,7 +59,8 @@ class GatePlanning:
         hold: ControlHold,
     ) -> None:
         self._settings, self._vehicle, self._hold = settings, vehicle, hold
-        self._final_velocity = np.asarray(values["final_velocity"], dtype=np.float64)
+        self._pad = np.asarray(values["final_position"], dtype=np.float64)
+        self._glideslope_rad = float(values["glideslope_angle_max"])
         self.kept: Reference | None = None
         self._first_start_s = 0.0
         self._asked: PlanRequest | None = None
@@ -94,6 +98,7 @@ class GatePlanning:
                 "thrust_min": least,
                 "gate_height": self._settings.gate_altitude_m,
                 "final_velocity": descent,
+                "glideslope_angle_max": self._approach_angle_rad(expected),
             },
             warm_start=None if kept is None else kept.plan,
             elapsed_s=0.0 if kept is None else expected.time_s - kept.start_s,
@@ -127,6 +132,15 @@ class GatePlanning:
             self._first_start_s = reference.start_s
         self.kept = reference
         return True
+
+    def _approach_angle_rad(self, expected: Motion) -> float:
+        """Of the cone of the next plan: narrow where possible; after refusals the mission's."""
+        if self._refused >= len(_RELEASED) - 1:
+            return self._glideslope_rad
+        up, *across = np.asarray(expected.position) - self._pad
+        seen_rad = math.atan2(math.hypot(*across), max(float(up), 0.0))
+        wanted_rad = max(self._settings.approach_angle_max_rad, seen_rad + _ANGLE_MARGIN_RAD)
+        return min(self._glideslope_rad, wanted_rad)
 
     @property
     def _released(self) -> float:

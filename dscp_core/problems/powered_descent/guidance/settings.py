@@ -85,6 +85,15 @@ class GuidanceSettings:
         upper=0.9,
         source=_TUNED,
     )
+    approach_angle_max_rad: float = option(
+        1.5,
+        "rad",
+        "Greatest angle between the line of sight from the pad and the vertical that plans keep "
+        "within: whatever the mission allows, who is off the plan needs air below.",
+        lower=1e-3,
+        upper=1.57,
+        source=_TUNED,
+    )
     floor_reserve: float = option(
         0.0, "1", "Part of the least thrust that plans stay above it.", upper=0.9, source=_SCALED
     )

@@ -159,6 +159,25 @@ def test_a_vehicle_that_cannot_hover_stops_at_the_ground_and_cuts_off() -> None:
     assert "cut off" not in np.array(record.phases)[lit]
 
 
+def test_a_mission_without_a_glideslope_is_not_flown_along_the_ground() -> None:
+    # The optimum from here skims the ground for kilometres: nothing is below to err into.
+    mars = {
+        "gravity": 3.7114,
+        "initial_position": (1500.0, 2000.0, 0.0),
+        "initial_velocity": (-75.0, 100.0, 0.0),
+        "initial_mass": 1905.0,
+        "dry_mass": 0.0,
+        "thrust_min": 4971.8,
+        "thrust_max": 13258.2,
+        "specific_impulse": 200.5,
+        "pointing_angle_max": 1.55,
+        "glideslope_angle_max": 1.57,
+        "terminal_time": 75.0,
+    }
+    summary = DescentSimulation(planner(**mars), {"replan_s": 5.0}).fly(1000)
+    assert summary.success, summary.story
+
+
 def test_nothing_to_fly_is_told_at_once() -> None:
     doomed = planner(initial_position=(1500.0, 0.0, 0.0), initial_velocity=(-230.0, 0.0, 0.0))
     with pytest.raises(NothingToFlyError, match="INFEASIBLE"):

@@ -49,6 +49,22 @@ def test_a_plan_is_asked_for_to_the_gate_with_a_reserve(planning: GatePlanning) 
     assert request.parameters["thrust_max"] == pytest.approx(0.92 * 845.2e3)
 
 
+def test_plans_leave_air_below_where_the_mission_does_not(
+    planner: Planner, outcome: PlanOutcome
+) -> None:
+    values = planner.problem.table.unpack(planner.parameters) | {"glideslope_angle_max": 1.57}
+    planning = GatePlanning(SETTINGS, Vehicle.of(values), values, ControlHold.MEAN)
+    assert ask(planning, 0.0).parameters["glideslope_angle_max"] == 1.5
+    flat = Motion(1.0, np.array([15e3, 520e3, 0.0]), np.zeros(3), 38000.0)
+    seen = np.arctan2(520.0, 15.0)
+    asked = planning.request(1.0, flat)
+    assert seen < asked.parameters["glideslope_angle_max"] < 1.57
+    for _ in range(3):
+        planning.take(asked, replace(outcome, status=PlanStatus.INFEASIBLE), 1.1)
+        asked = planning.request(1.1, flat)
+    assert asked.parameters["glideslope_angle_max"] == 1.57
+
+
 def test_the_reserve_is_given_back_and_planning_ends(
     planning: GatePlanning, outcome: PlanOutcome
 ) -> None:
