@@ -63,8 +63,9 @@ deadline, solver_failure), message, certified, converged, stopped (why the itera
 cost_to_gain (what the plan costs more than a local optimum, at most, in the cost's unit; an
 estimate), terminal_time_s, iterations, cost, cost_unit, subproblem_costs (what the iterations
 minimise of the running and the terminal cost), final_STATE_UNIT for every state (such as
-final_mass_kg), certificate (with MISS_UNIT for every miss, such as miss_position_m, and checks with
-name, worst_value, bound, margin, unit, time_s, passed), solve_time_ms, solver, virtual_control,
+final_mass_kg), certificate (with MISS_UNIT for every miss, such as miss_position_m, checks with
+name, worst_value, bound, margin, unit, time_s, passed, and unchecked, the limits whose bound is
+unknown or infinite), solve_time_ms, solver, virtual_control,
 max_defect, least_feasible_terminal_time_s, best_effort (with --best-effort and no certified plan:
 violations, steps, terminal_time_s, final_STATE_UNIT, certificate; --plot and --output then draw and
 write it). null stands for what does not exist or is unknown.
@@ -74,6 +75,7 @@ exit codes: 0 certified plan, 2 bad input, 3 no such plan.
 
 # Of states whose final value is not pinned, this many are printed.
 _MOST_FINAL_STATES = 8
+_HELD = {"mean": "held at interval means", "linear": "linear between the nodes"}
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -254,10 +256,8 @@ def _certificate(problem: OptimalControlProblem, certificate: PlanCertificate) -
         **missed,
         **flight_figures(certificate),
         "control_hold": certificate.hold,
-        "checks": [
-            {**asdict(check), "margin": check.bound - check.worst_value}
-            for check in certificate.checks
-        ],
+        "unchecked": certificate.unchecked,
+        "checks": [{**asdict(check), "margin": check.margin} for check in certificate.checks],
     }
 
 
@@ -312,7 +312,7 @@ def _print(described: dict[str, Any], planner: Planner, outcome: PlanOutcome) ->
         print(f"  {label:<{widths[0]}}  {value:>{widths[1]}}  {note}".rstrip())
     if plan is None or outcome.certificate is None:
         return
-    print("  certificate, flown with the controls held at interval means:")
+    print(f"  certificate, flown with the controls {_HELD[outcome.certificate.hold.value]}:")
     checks = [
         (
             check["name"],
@@ -326,6 +326,9 @@ def _print(described: dict[str, Any], planner: Planner, outcome: PlanOutcome) ->
         for check in certificate["checks"]
     ]
     print_table(("check", "worst", "bound", "margin", "unit", "at", ""), checks, indent="    ")
+    if certificate["unchecked"]:
+        names = ", ".join(certificate["unchecked"])
+        print(f"    NOT checked, the bound being unknown or infinite: {names}")
     figures = flight_figures(outcome.certificate)
     if figures:
         print("    flown: " + ", ".join(f"{name} {value:.7g}" for name, value in figures.items()))

@@ -269,6 +269,21 @@ def test_text_for_people(capsys: pytest.CaptureFixture[str]) -> None:
     assert "32.0482 s" in text
 
 
+def test_what_is_not_checked_and_how_it_is_flown_is_told(
+    plan: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    silent = tmp_path / "silent.yaml"
+    silent.write_text("initial_mass: 38000\n", encoding="utf-8")
+    case = ("--vehicle", str(silent), "--hold", "linear")
+    code, answer = plan(*case)
+    assert code == ExitCode.OK
+    assert answer["certificate"]["unchecked"] == ["dry_mass", "thrust_rate_max"]
+    assert main(["plan", "powered_descent", *case]) == ExitCode.OK
+    text = capsys.readouterr().out
+    assert "flown with the controls linear between the nodes:" in text
+    assert "NOT checked, the bound being unknown or infinite: dry_mass, thrust_rate_max" in text
+
+
 def test_needs_neither_ros_nor_torch_nor_matplotlib() -> None:
     code = (
         "import sys\n"
