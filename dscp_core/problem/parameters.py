@@ -194,19 +194,12 @@ def load_parameter_file(path: str | Path) -> dict[str, Value]:
     The names are checked where the values are used, by `ParameterTable.pack`.
 
     Raises:
-        InvalidInputError: The file is missing, is no YAML, or is no mapping of numbers.
+        InvalidInputError: The file is missing, is no YAML, gives a name twice, or is no mapping of
+            numbers.
     """
-    import yaml
+    from dscp_core.problem.yaml_files import read_yaml
 
-    path = Path(path)
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InvalidInputError("parameter file", str(path), f"a readable file ({error})") from None
-    try:
-        content = yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        raise InvalidInputError("parameter file", str(path), f"valid YAML ({error})") from None
+    content = read_yaml("parameter file", path)
     if not isinstance(content, dict) or not all(isinstance(name, str) for name in content):
         raise InvalidInputError("parameter file", str(path), "a mapping of names to SI values")
     return content

@@ -12,12 +12,10 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
-import yaml
-
 from dscp_core.errors import InvalidInputError
+from dscp_core.problem.yaml_files import read_yaml
 
 _SECTION_KEY = "ros__parameters"
 _NODE_OVERRIDE = re.compile(r"^(?:(?P<node>[^:]+):)?(?P<name>[^:]+):=")
@@ -38,17 +36,6 @@ class ParameterArguments:
     files: tuple[str, ...]
     names: frozenset[str]
     nodes: tuple[str, ...]
-
-
-class _Loader(yaml.SafeLoader):
-    """Reads 1e-8 as a number, as rcl does; PyYAML takes it for a text."""
-
-
-_Loader.add_implicit_resolver(
-    "tag:yaml.org,2002:float",
-    re.compile(r"^[-+]?[0-9]+(\.[0-9]*)?[eE][-+]?[0-9]+$"),
-    list("-+0123456789"),
-)
 
 
 def parameter_arguments(arguments: Sequence[str]) -> ParameterArguments:
@@ -157,12 +144,7 @@ def read_file(path: str, node_name: str) -> dict[str, Any]:
 
 def _sections(path: str) -> Iterator[tuple[str, Mapping[str, Any]]]:
     """Pairs of node name and parameters in a file."""
-    try:
-        content = yaml.load(Path(path).read_text(encoding="utf-8"), Loader=_Loader)
-    except (OSError, UnicodeDecodeError) as error:
-        raise InvalidInputError("parameter file", path, f"a readable file ({error})") from None
-    except yaml.YAMLError as error:
-        raise InvalidInputError("parameter file", path, f"valid YAML ({error})") from None
+    content = read_yaml("parameter file", path)
     if not isinstance(content, dict):
         raise InvalidInputError("parameter file", path, "a mapping of node names")
     yield from _nested_sections(path, "", content)

@@ -140,8 +140,23 @@ def test_parameter_file(tmp_path: Path, table: ParameterTable) -> None:
         (b"", "a mapping of names"),
         (b"1: 2\n", "a mapping of names"),
         (b"\xff\xfe\xfa", "a readable file"),
+        (b"thrust_max: 1\nthrust_max: 2\n", "thrust_max is given twice"),
+        (b"thrust_max: 2026-13-45\n", "valid YAML"),
+        (b"thrust_max: " + b"9" * 5000, "valid YAML"),
+        (b"thrust_max: " + b"[" * 3000 + b"]" * 3000, "valid YAML"),
     ],
-    ids=["missing", "no YAML", "list", "empty", "number as name", "no text"],
+    ids=[
+        "missing",
+        "no YAML",
+        "list",
+        "empty",
+        "number as name",
+        "no text",
+        "twice",
+        "no date",
+        "too many digits",
+        "too deep",
+    ],
 )
 def test_bad_parameter_file(tmp_path: Path, content: bytes | None, bound: str) -> None:
     path = tmp_path / "vehicle.yaml"
@@ -152,6 +167,28 @@ def test_bad_parameter_file(tmp_path: Path, content: bytes | None, bound: str) -
     assert caught.value.field == "parameter file"
     assert str(path) in str(caught.value)
     assert bound in caught.value.bound
+
+
+@pytest.mark.parametrize(
+    ("written", "meant"),
+    [("8.4e5", 8.4e5), ("8e5", 8e5), ("84", 84.0), ("+84.", 84.0), ("010", 10.0), (".5e3", 500.0)],
+)
+def test_numbers_in_files_are_what_they_look_like(
+    tmp_path: Path, table: ParameterTable, written: str, meant: float
+) -> None:
+    path = tmp_path / "vehicle.yaml"
+    path.write_text(f"thrust_max: {written}\n", encoding="utf-8")
+    assert table.pack(load_parameter_file(path))[0] == meant
+
+
+@pytest.mark.parametrize("written", ["1:30", "1_000", "0x10", "1e", "--1", "'84'"])
+def test_what_only_may_be_a_number_is_refused(
+    tmp_path: Path, table: ParameterTable, written: str
+) -> None:
+    path = tmp_path / "vehicle.yaml"
+    path.write_text(f"thrust_max: {written}\n", encoding="utf-8")
+    with pytest.raises(InvalidInputError, match="thrust_max"):
+        table.pack(load_parameter_file(path))
 
 
 def test_directory_is_no_parameter_file(tmp_path: Path) -> None:
