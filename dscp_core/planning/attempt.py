@@ -30,6 +30,8 @@ _STATUS = {
     ScpStatus.DIVERGED: PlanStatus.SOLVER_FAILURE,
 }
 
+_NO_PLAN = (PlanStatus.INFEASIBLE, PlanStatus.ITERATION_LIMIT, PlanStatus.SOLVER_FAILURE)
+
 
 @dataclass(frozen=True)
 class Start:
@@ -162,6 +164,12 @@ class Attempt:
                 "max_defect": layout.relative(evaluation.defects),
                 "cost": evaluation.cost,
             }
+        if status in _NO_PLAN:
+            state = scp.transcription.initial_state(result.parameters)
+            refused = self._verifier.refused_at(state, result.parameters)
+            if refused:
+                status = PlanStatus.INFEASIBLE
+                message = f"the start is out of bounds: {'; '.join(refused)}; {message}"
         return self._outcome(status, message, start.parameters, start.source, **found)
 
     def _outcome(

@@ -167,6 +167,20 @@ class PlanVerifier:
         self._limits.bounds(known_values(self._problem.table, parameters))
         self._limits.require_hold(parameters, self._hold)
 
+    def refused_at(self, state: Array, parameters: Array) -> tuple[str, ...]:
+        """Which limits a state is beyond, by more than is accepted, whatever is flown from it.
+
+        Args:
+            state: (nx,), SI.
+            parameters: Packed parameters, SI.
+        """
+        bounds = self._limits.bounds(known_values(self._problem.table, parameters))
+        return tuple(
+            f"{limit.name} {value:.4g} {limit.unit} exceeds {bounds[limit.name]:.4g}"
+            for limit, value in self._limits.of_states(state, parameters)
+            if value > bounds[limit.name]
+        )
+
     def certify(
         self, times_s: Array, states: Array, controls: Array, parameters: Array
     ) -> PlanCertificate:

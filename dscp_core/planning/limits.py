@@ -140,6 +140,15 @@ class Limits:
             ]
         ends += [value(_watched(c)) for c in last]
         self._ends = CompiledFunction("ends", inputs, [_stack(ends)])
+        alone = [v for v, of_state in zip(values, self.of_state, strict=True) if of_state]
+        self._of_states = CompiledFunction("of_states", inputs, [_stack(alone)])
+
+    def of_states(self, state: Array, packed: Array) -> list[tuple[Limit, float]]:
+        """Limits along the flight that depend on the state alone, with their values at one."""
+        limits = [one for one, alone in zip(self.along, self.of_state, strict=True) if alone]
+        nothing = np.zeros(len(self._problem.controls))
+        values = self._of_states(state, nothing, nothing, np.append(1.0, packed))[0]
+        return list(zip(limits, values, strict=True))
 
     def ends(
         self, state: Array, control: Array, change: Array, interval_s: float, packed: Array

@@ -265,6 +265,20 @@ def test_ground_is_where_the_landing_site_is() -> None:
     assert ">= 100 m" in outcome.message
 
 
+@pytest.mark.parametrize("source", [TerminalTime.FIXED, TerminalTime.FREE])
+def test_a_start_outside_the_glideslope_is_told_as_such(
+    fixed: Planner, free: Planner, source: TerminalTime
+) -> None:
+    planner = free if source is TerminalTime.FREE else fixed
+    state = START.copy()
+    state[:6] = [388.0, 2438.1, 0.0, -5.5, -48.7, -4.4]
+    outcome = planner.plan(state)
+    assert outcome.status is PlanStatus.INFEASIBLE
+    beyond = np.cos(np.radians(80.0)) * state[1] - np.sin(np.radians(80.0)) * state[0]
+    told = f"the start is out of bounds: glideslope {beyond:.4g} m exceeds 1"
+    assert outcome.message.startswith(told)
+
+
 def test_hopeless_state_is_no_success(fixed: Planner) -> None:
     # A hundred metres up at 150 m/s.
     state = START.copy()
