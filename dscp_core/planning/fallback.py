@@ -23,6 +23,8 @@ Array = NDArray[np.float64]
 
 _FACTORS = (1.0, 0.5, 2.0)
 """First guesses of the terminal time, in units of the problem's own."""
+_SAME_TIME = 1e-6
+"""What solvers leave, relative."""
 
 
 class Fallback:
@@ -32,17 +34,20 @@ class Fallback:
         least: Finds them.
     """
 
-    def __init__(self, free: Scp, verifier: PlanVerifier) -> None:
+    def __init__(
+        self, free: Scp, verifier: PlanVerifier, time_bounds_s: tuple[float, float]
+    ) -> None:
         """Compile the relaxed problem.
 
         Args:
             free: Loop of the problem with a free terminal time.
             verifier: Flies and checks plans.
+            time_bounds_s: Least and greatest terminal time where it is free.
 
         Raises:
             InvalidInputError: The problem declares no concessions.
         """
-        self._free, self._verifier = free, verifier
+        self._free, self._verifier, self._time_bounds_s = free, verifier, time_bounds_s
         self._problem = free.transcription.problem
         relaxation = Relaxation.of(self._problem, free.transcription.costs.models)
         if relaxation is None:
@@ -150,11 +155,7 @@ class Fallback:
         ]
         lines += certificate.reasons
         values = self._problem.table.unpack(packed)
-        if source is TerminalTime.FIXED:
-            lines.append(
-                f"{TERMINAL_TIME} {reached.terminal_time_s:.4g} s is not the "
-                f"{values[TERMINAL_TIME]:.4g} s asked for"
-            )
+        lines += self._of_time(reached.terminal_time_s, float(values[TERMINAL_TIME]), source)
         for name, value in widened.items():
             unit = self._problem.table[name].unit
             lines.append(
@@ -162,6 +163,16 @@ class Fallback:
             )
         # Else nothing says why this is no plan.
         return tuple(lines) or (outcome.message,)
+
+    def _of_time(self, seconds: float, asked_s: float, source: TerminalTime) -> list[str]:
+        """In which way the terminal time is not what was asked for."""
+        fixed = source is TerminalTime.FIXED
+        low, high = (asked_s, asked_s) if fixed else self._time_bounds_s
+        if (1.0 - _SAME_TIME) * low <= seconds <= (1.0 + _SAME_TIME) * high:
+            return []
+        if fixed:
+            return [f"{TERMINAL_TIME} {seconds:.5g} s is not the {asked_s:.5g} s asked for"]
+        return [f"{TERMINAL_TIME} {seconds:.5g} s is not within {low:.5g} to {high:.5g} s"]
 
     def _steps(self, reached: Reached) -> tuple[str, ...]:
         """What was made least, with what it came to."""

@@ -62,7 +62,8 @@ class BestEffort:
 
     Attributes:
         plan: The trajectory; it starts from the state that was planned from.
-        certificate: Its check, which did not pass.
+        certificate: Its check; it passes only where nothing but the terminal time is another than
+            asked for.
         violations: What it violates and by how much, one line each, the gravest first.
         steps: What was made least, in this order, each with what it came to.
 

@@ -124,7 +124,7 @@ class Planner:
         self.time_bounds_s = self._bounds_of_time()
         self._fallback: Fallback | None = None
         if settings.best_effort:
-            self._fallback = Fallback(self._loop(free=True), self._verifier)
+            self._fallback = Fallback(self._loop(free=True), self._verifier, self.time_bounds_s)
 
     def __reduce__(self) -> tuple[Any, ...]:
         """By what it was made of; the copy compiles its own functions, and has the usual clock."""

@@ -182,7 +182,17 @@ def test_another_terminal_time_than_the_fixed_one_is_a_violation() -> None:
     effort = effort_of(outcome)
     assert outcome.status is PlanStatus.INFEASIBLE
     assert effort.plan.terminal_time_s == pytest.approx(32.8, abs=0.1)
-    assert "terminal_time 32.81 s is not the 31 s asked for" in effort.violations
+    (told,) = (line for line in effort.violations if "asked for" in line)
+    assert told == f"terminal_time {effort.plan.terminal_time_s:.5g} s is not the 31 s asked for"
+
+
+def test_a_terminal_time_out_of_its_bounds_is_a_violation() -> None:
+    # Fuel for 33 s at the least thrust and more, and 40 s to be flown: it lands before.
+    values = {"terminal_time_min": 40.0, "dry_mass": 31700.0}
+    effort = effort_of(planner_of(values).plan())
+    seconds = effort.plan.terminal_time_s
+    assert seconds < 39.0
+    assert f"terminal_time {seconds:.5g} s is not within 40 to 200 s" in effort.violations
 
 
 def test_more_thrust_never_gives_a_larger_error() -> None:
