@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
+from itertools import chain, repeat
 from typing import Any
 
 import casadi as ca
@@ -144,6 +145,7 @@ class LeastViolation:
         starts: Iterable[tuple[float, Array | None]],
         left_s: Callable[[], float | None],
         count: Callable[[ScpResult], None],
+        otherwise: Iterable[tuple[float, Array | None]] = (),
     ) -> Reached | None:
         """The best that is reached from any of the starts; None where none leads anywhere.
 
@@ -153,10 +155,12 @@ class LeastViolation:
                 for the problem's guess.
             left_s: Wall time that is left, or None.
             count: Told of every run.
+            otherwise: More starts, as long as nothing is found.
         """
         best: Reached | None = None
-        for seconds, reference in starts:
-            if left_s() == 0.0:
+        every = chain(zip(repeat(False), starts), zip(repeat(True), otherwise))
+        for more, (seconds, reference) in every:
+            if left_s() == 0.0 or (more and best is not None):
                 break
             found = _Search(self, packed, seconds, left_s, count, best).from_(reference)
             if found is not None and (best is None or self._is_better(found, best, packed)):

@@ -23,6 +23,8 @@ Array = NDArray[np.float64]
 
 _FACTORS = (1.0, 0.5, 2.0)
 """First guesses of the terminal time, in units of the problem's own."""
+_SOONER = (0.25, 0.125, 0.0625)
+"""Where those lead nowhere, as where what the problem guesses is kept above a least time."""
 _SAME_TIME = 1e-6
 """What solvers leave, relative."""
 
@@ -79,8 +81,13 @@ class Fallback:
         widened = self.least.widened(state, packed)
         values = {**self._problem.table.unpack(packed), **widened}
         changed = self._problem.table.pack(values)
-        starts = self._starts(state, packed, left)
-        reached = self.least.find(changed, starts, attempt.left_s, attempt.count)
+        reached = self.least.find(
+            changed,
+            self._starts(state, packed, left),
+            attempt.left_s,
+            attempt.count,
+            self._sooner(state, packed),
+        )
         if reached is None:
             words = "deadline" if attempt.left_s() == 0.0 else self._nothing()
             message = f"{outcome.message}; no best effort: {words}"
@@ -117,16 +124,27 @@ class Fallback:
                 layout.states(reference), layout.controls(reference)
             )
             yield left.seconds, self.least.layout.reference(*extended, left.seconds)
-        problem, guess = self._problem, self._problem.terminal_time_guess
-        given = float(packed[problem.table.slice(TERMINAL_TIME)][0])
-        if guess is None:
-            seconds = given
-        else:
-            seconds = float(numeric("terminal_time_guess", problem.table, guess, packed, state))
+        guessed, given = self._guess(state, packed), self._given(packed)
         for factor in _FACTORS:
-            yield factor * seconds, None
-        if guess is not None:
+            yield factor * guessed, None
+        if given != guessed:
             yield given, None
+
+    def _sooner(self, state: Array, packed: Array) -> Iterator[tuple[float, Array | None]]:
+        """Where those lead nowhere: an end that comes far sooner than is allowed or asked for."""
+        guessed = self._guess(state, packed)
+        for factor in _SOONER:
+            yield factor * guessed, None
+
+    def _guess(self, state: Array, packed: Array) -> float:
+        """The problem's guess of the terminal time, or else the parameter, in seconds."""
+        problem, guess = self._problem, self._problem.terminal_time_guess
+        if guess is None:
+            return self._given(packed)
+        return float(numeric("terminal_time_guess", problem.table, guess, packed, state))
+
+    def _given(self, packed: Array) -> float:
+        return float(packed[self._problem.table.slice(TERMINAL_TIME)][0])
 
     def _nothing(self) -> str:
         """Why there is none, as far as can be told."""

@@ -195,6 +195,16 @@ def test_a_terminal_time_out_of_its_bounds_is_a_violation() -> None:
     assert f"terminal_time {seconds:.5g} s is not within 40 to 200 s" in effort.violations
 
 
+def test_a_least_terminal_time_does_not_keep_a_best_effort_from_ending_sooner() -> None:
+    # It hits the ground after 6.3 s, whatever it does.
+    fast = {"initial_position": (1565.0, 552.0, 585.0), "initial_velocity": (-288.0, 67.0, -31.0)}
+    without = effort_of(planner_of(fast).plan())
+    effort = effort_of(planner_of({**fast, "terminal_time_min": 43.0}).plan())
+    assert effort.violations[0] == without.violations[0]
+    assert effort.plan.terminal_time_s == pytest.approx(without.plan.terminal_time_s, rel=1e-3)
+    assert effort.plan.terminal_time_s == pytest.approx(6.3, abs=0.2)
+
+
 def test_more_thrust_never_gives_a_larger_error() -> None:
     speeds = []
     for share in (0.6, 0.7, 0.85, 1.0, 1.15):
