@@ -187,6 +187,7 @@ class Pilot:
                 piece = piece.split(at, rising(at))[0]
             at = first_rise(piece, rising, _ROUNDING * float(lengths[step]))
             part = self._propagator.within(flight, step, at, interval_s, packed)
+            part.right[0, 0, _EVENT] = 0.0  # up to what is left of looking for it
             return flight.first(step).and_then(part), True
         return flight, False
 

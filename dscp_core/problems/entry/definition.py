@@ -20,7 +20,7 @@ from dscp_core.problem.declaration import (
     Variable,
     Where,
 )
-from dscp_core.problem.ending import Tolerance
+from dscp_core.problem.ending import EndEvent, Tolerance
 from dscp_core.problem.extras import Extras
 from dscp_core.problems.entry.aero_table import read_aerodynamic_table
 from dscp_core.problems.entry.checks import check_parameters, check_printed, check_state
@@ -278,6 +278,25 @@ def _miss_heading(x: ca.SX, p: Parameters) -> ca.SX:
     return ca.fabs(_turned(x, p))
 
 
+# So that a flight to a target on the ground is not held to be one into it.
+_GROUND_ROUNDING_M = 1.0
+
+
+def _above_ground(x: ca.SX, p: Parameters) -> ca.SX:
+    """Altitude above what counts as contact, m."""
+    return x[RADIUS] - p["planet_radius"] + _GROUND_ROUNDING_M
+
+
+_GROUND = EndEvent(
+    "contact with the ground",
+    _above_ground,
+    "altitude_floor",
+    "m",
+    tolerance=0.0,
+    meant=lambda values: False,
+)
+
+
 def _weighted(problem: OptimalControlProblem, gamma: float, rates: float) -> OptimalControlProblem:
     """The problem with default trust-region weights on the flight-path angle and the rates."""
     return replace(
@@ -335,6 +354,7 @@ def entry(formulation: Formulation = Formulation.QUADRATIC) -> OptimalControlPro
                 ("heading", _miss_heading, "rad"),
             )
         ),
+        end_event=_GROUND,
         control_states=(ALPHA, BANK),
         formulation=Formulation.QUADRATIC.value,
         extras=Extras(

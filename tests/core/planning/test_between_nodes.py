@@ -210,6 +210,18 @@ def test_a_start_below_the_ground_is_within_the_floors_tolerance_or_not(
     )
 
 
+@pytest.mark.parametrize("seed", range(8))
+def test_contact_itself_is_not_below_the_ground(seed: int) -> None:
+    height, speed = np.random.default_rng(seed).uniform([10.0, 5.0], [80.0, 20.0])
+    event = runner().end_event
+    assert event is not None
+    exact = replace(runner(), end_event=replace(event, tolerance=0.0))
+    certificate = run(exact, start=(0.0, height, 100.0, -speed))
+    assert certificate.contact_time_s is not None
+    assert certificate.value("height_floor") == 0.0
+    assert certificate.check("height_floor").passed
+
+
 @pytest.mark.parametrize(("rate", "passes"), [(5.001, True), (4.999, False)])
 def test_the_rate_of_controls_that_are_held_linearly(rate: float, passes: bool) -> None:
     def pushing(times: Array) -> Array:

@@ -281,6 +281,63 @@ def test_certificate_fails_where_a_limit_is_exceeded(planner: Planner) -> None:
     assert any(reason.startswith("miss_position") for reason in astray.reasons)
 
 
+# A capsule over Mars, where the air at the ground is thin enough for 1.5 km/s.
+OVER_MARS: dict[str, Any] = {
+    "angle_of_attack_min": 0.0,
+    "angle_of_attack_max": 0.3,
+    "drag_coefficients": [1.45, 0.0, 0.0, 0.0],
+    "lift_coefficients": [1.25, 0.0, 0.0],
+    "surface_to_mass_ratio": 1.0,
+    "reference_area": 15.9,
+    "mass": 3300.0,
+    "planet_radius": 3397e3,
+    "gravitational_parameter": 4.2828e13,
+    "sea_level_density": 0.0158,
+    "scale_height": 9354.5,
+    "speed_of_sound": 220.0,
+    "speed_min": 300.0,
+    "dynamic_pressure_max": 2e4,
+    "load_factor_max": 18.0,
+    "heat_rate_max": 1e7,
+    "initial_longitude": 0.0,
+    "initial_latitude": 0.0,
+    "initial_heading": 1.5,
+    "initial_speed": 1500.0,
+    "initial_angle_of_attack": 0.3,
+    "initial_bank_angle": 0.0,
+    "final_radius": 3400e3,
+    "final_altitude_tolerance": 500.0,
+}
+
+
+@pytest.mark.parametrize(("altitude_m", "hits"), [(500.0, True), (3000.0, False)])
+def test_no_flight_through_the_ground_is_certified(altitude_m: float, hits: bool) -> None:
+    problem = problems.get("entry")
+    start = {"initial_radius": 3397e3 + altitude_m, "initial_flight_path_angle": -0.14}
+    values = {**OVER_MARS, **start}
+    times, controls = np.linspace(0.0, 20.0, 11), np.zeros((11, 2))
+    groundless = PlanVerifier(replace(problem, end_event=None), 10)
+    state = Planner(problem, parameters=values).initial_state
+    states = np.tile(state, (11, 1))
+    flown = groundless.certify(times, states, controls, problem.pack(values))
+    assert (flown.states[:, 0].min() < 3397e3 - 100.0) is np.bool_(hits)
+    # The target is where it ends; without the ground, nothing is wrong.
+    values["final_radius"] = max(flown.states[-1, 0], 3397e3)
+    for name, index in (
+        ("longitude", 1),
+        ("latitude", 2),
+        ("flight_path_angle", 4),
+        ("heading", 5),
+    ):
+        values[f"final_{name}"] = flown.states[-1, index]
+    packed = problem.pack(values)
+    assert groundless.certify(times, states, controls, packed).passed
+    certificate = PlanVerifier(problem, 10).certify(times, states, controls, packed)
+    assert certificate.passed is not hits
+    if hits:
+        assert certificate.reasons[0].startswith("contact with the ground at ")
+
+
 def test_states_of_the_flight_can_be_planned_from_cold() -> None:
     settings = PlannerSettings(
         intervals=60,
