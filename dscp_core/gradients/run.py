@@ -20,6 +20,7 @@ from dscp_core.errors import DscpError, InvalidInputError
 from dscp_core.gradients.gradient import Gradient, Method
 from dscp_core.gradients.losses import Loss
 from dscp_core.gradients.quantities import quantity
+from dscp_core.problem import checks
 from dscp_core.scp.scp import Iteration, Scp, ScpResult, ScpStatus
 from dscp_core.transcription.analysis import CostForm
 
@@ -202,6 +203,7 @@ def of_plan(scp: Scp, trace: ScpResult, loss: Loss, method: Method) -> Gradient:
         DifferentiationError: The trace ended without a usable result, or the gradient overflows.
         InvalidInputError: The implicit method, and a loss that depends on earlier iterates.
     """
+    method = checks.choice("method", method, Method)
     compute = unrolled if method is Method.UNROLLED else implicit
     gradient = compute(scp, trace, loss)
     reasons = gradient.reasons

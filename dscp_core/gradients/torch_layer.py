@@ -21,6 +21,7 @@ from dscp_core.gradients.gradient import Gradient, Method, parts, positions
 from dscp_core.gradients.losses import Loss, SeedLoss
 from dscp_core.gradients.run import DifferentiationError, implicit, unrolled
 from dscp_core.gradients.samples import SampleReport, report_of
+from dscp_core.problem import checks
 from dscp_core.problem.declaration import TERMINAL_TIME
 from dscp_core.problem.parameters import Value
 from dscp_core.scp.scp import Scp, ScpResult, ScpStatus
@@ -78,7 +79,7 @@ class DscpLayer(torch.nn.Module, ABC):
         super().__init__()
         problem = scp.transcription.problem
         self._scp = scp
-        self._method = method
+        self._method = checks.choice("method", method, Method)
         self._positions = {name: positions(problem, name) for name in inputs}
         self._parts = tuple(part for name in inputs for part in parts(problem, name))
         if not inputs or len(set(self._parts)) != len(self._parts):

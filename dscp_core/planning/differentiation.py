@@ -14,6 +14,7 @@ from dscp_core.gradients.quantities import quantity
 from dscp_core.gradients.run import DifferentiationError, of_plan, settle
 from dscp_core.planning.certificate import PlanVerifier
 from dscp_core.planning.plan import PlanOutcome, TerminalTime
+from dscp_core.problem import checks
 from dscp_core.problem.flight import ControlHold
 from dscp_core.problem.trajectory import Plan
 from dscp_core.scp.restoration import flyable
@@ -67,7 +68,7 @@ def differentiable(scp: Scp) -> Scp:
 def suited_method(loss: Loss, method: Method | None) -> Method:
     """The method that was asked for, or else implicit, except for what depends on the way."""
     if method is not None:
-        return method
+        return checks.choice("method", method, Method)
     return Method.UNROLLED if isinstance(loss, ConvergenceLoss) else Method.IMPLICIT
 
 

@@ -100,7 +100,8 @@ class Planner:
                 "problem", problem, "an OptimalControlProblem; problems.get(NAME) gives one"
             )
         settings = PlannerSettings.suited(problem) if settings is None else settings
-        changed = {} if vehicle is None else problem.read_vehicle(vehicle)
+        known = settings.parameters
+        changed = {} if vehicle is None else problem.read_vehicle(vehicle, known)
         changed |= parameters or {}
         settings = replace(settings, **changes, parameters={**settings.parameters, **changed})
         if (settings.terminal_time is TerminalTime.PREDICTED) != (predictor is not None):

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from dscp_core.errors import InvalidInputError
 from dscp_core.planning.plan import TerminalTime
 from dscp_core.problem.trajectory import Plan
 from dscp_core.transcription.layout import TrajectoryLayout
@@ -44,7 +45,15 @@ class Remainder:
     def of(
         plan: Plan | None, problem: str, elapsed_s: float, state: Array, layout: TrajectoryLayout
     ) -> Remainder | None:
-        """What is left of a plan of this problem, where that is enough to start from."""
+        """What is left of a plan of this problem, where that is enough to start from.
+
+        Raises:
+            InvalidInputError: It is no plan.
+        """
+        given: object = plan
+        if given is not None and not isinstance(given, Plan):
+            kind = f"a {type(given).__name__}"
+            raise InvalidInputError("warm_start", kind, "a Plan, such as outcome.plan")
         if plan is None or plan.problem != problem or not elapsed_s >= 0.0:
             return None
         seconds = plan.terminal_time_s - elapsed_s

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from enum import Enum
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dscp_core.errors import InvalidInputError
 from dscp_core.planning.plan import TerminalTime
+from dscp_core.problem import checks
 from dscp_core.problem.declaration import OptimalControlProblem
 from dscp_core.problem.flight import ControlHold, Discretisation
 from dscp_core.problem.parameters import Value
@@ -68,11 +69,10 @@ class PlannerSettings:
             ("hold", ControlHold),
             ("discretisation", Discretisation),
         ):
-            try:
-                object.__setattr__(self, name, kind(getattr(self, name)))
-            except ValueError:
-                known = ", ".join(member.value for member in kind)
-                raise InvalidInputError(name, getattr(self, name), f"one of {known}") from None
+            chosen: Enum = checks.choice(name, getattr(self, name), kind)
+            object.__setattr__(self, name, chosen)
+        checks.mapping("parameters", self.parameters)
+        checks.plain("", self, ScpOptions=ScpOptions)
 
     @staticmethod
     def suited(problem: OptimalControlProblem, **changes: Any) -> PlannerSettings:

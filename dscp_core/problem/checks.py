@@ -5,9 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import fields
-from typing import Any
+from enum import Enum
+from numbers import Integral
+from typing import Any, TypeVar
 
 from dscp_core.errors import InvalidInputError
+
+Choice = TypeVar("Choice", bound=Enum)
 
 
 def members(field: str, values: Any, kind: type) -> tuple[Any, ...]:
@@ -51,6 +55,29 @@ def plain(what: str, declared: Any, **kinds: type) -> None:
         if kind is not None and not isinstance(getattr(declared, name), kind):
             label = f"{name} of {what}" if what else name
             raise InvalidInputError(label, getattr(declared, name), f"of type {kind.__name__}")
+
+
+def choice(field: str, value: Any, kind: type[Choice]) -> Choice:
+    """A member of an enumeration, from itself or its value.
+
+    Raises:
+        InvalidInputError: Neither.
+    """
+    try:
+        return kind(value)
+    except ValueError:
+        known = ", ".join(str(member.value) for member in kind)
+        raise InvalidInputError(field, value, f"one of {known}") from None
+
+
+def whole(field: str, value: Any, least: int) -> None:
+    """Refuse what is no whole number from the least one.
+
+    Raises:
+        InvalidInputError: With the value.
+    """
+    if isinstance(value, bool) or not isinstance(value, Integral) or int(value) < least:
+        raise InvalidInputError(field, value, f"a whole number >= {least}")
 
 
 def distinct(field: str, names: Iterable[str], reserved: Sequence[str] = ()) -> None:

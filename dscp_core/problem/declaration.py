@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, TypeVar
@@ -321,13 +321,13 @@ class OptimalControlProblem:
         if self.check_state is not None:
             numeric("check_state", self.table, self.check_state, packed, state)
 
-    def read_vehicle(self, path: str | Path) -> dict[str, Value]:
-        """Values of a vehicle file, those of the tables that it points to included.
+    def read_vehicle(self, path: str | Path, given: Collection[str] = ()) -> dict[str, Value]:
+        """Values of a vehicle file and its tables, else `file_defaults` of what is not ``given``.
 
         Raises:
             InvalidInputError: The file or a table cannot be used, or both give a value.
         """
-        return vehicle_values(path, self.vehicle_tables, self.file_defaults)
+        return vehicle_values(path, self.vehicle_tables, self.file_defaults, given)
 
     def initial_state_values(self, state: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
         """Values, by name, of the parameters that hold an initial state (nx,), SI."""

@@ -124,7 +124,7 @@ class ParameterTable:
             InvalidInputError: Unknown name; the message lists the near ones.
         """
         if name not in self._by_name:
-            near = difflib.get_close_matches(name, self.names, n=3, cutoff=0.5)
+            near = difflib.get_close_matches(str(name), self.names, n=3, cutoff=0.5)
             hint = f"; did you mean {', '.join(near)}?" if near else f": {', '.join(self.names)}"
             raise InvalidInputError("parameter", name, f"a known name{hint}")
         return self._by_name[name]

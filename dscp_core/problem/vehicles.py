@@ -20,7 +20,10 @@ Reader = Callable[[Path], Mapping[str, Value]]
 
 
 def vehicle_values(
-    path: str | Path, tables: Mapping[str, Reader], silent: Mapping[str, Value]
+    path: str | Path,
+    tables: Mapping[str, Reader],
+    silent: Mapping[str, Value],
+    given: Collection[str] = (),
 ) -> dict[str, Value]:
     """Values of a vehicle file, those of the tables that it points to included.
 
@@ -28,6 +31,7 @@ def vehicle_values(
         path: The file.
         tables: What it may name besides parameters: name to a reader of the file it points to.
         silent: What holds where the file is silent.
+        given: Parameters of which it does not, as they have values already.
 
     Raises:
         InvalidInputError: The file or a table cannot be used, or both give a value.
@@ -44,7 +48,7 @@ def vehicle_values(
         if twice:
             raise InvalidInputError(name, table, f"no {', '.join(twice)} beside it")
         values.update(found)
-    return {**silent, **values}
+    return {**{n: v for n, v in silent.items() if n not in given}, **values}
 
 
 def as_vehicle(

@@ -54,7 +54,7 @@ def read_yaml(field: str, path: str | Path) -> Any:
     """
     try:
         text = Path(path).read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
+    except (OSError, ValueError) as error:  # no text, or no path
         raise InvalidInputError(field, str(path), f"a readable file ({error})") from None
     try:
         return yaml.load(text, Loader=_Loader)

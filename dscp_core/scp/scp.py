@@ -16,6 +16,7 @@ from dscp_core.cone.derivative.sensitivity import KktSystem
 from dscp_core.cone.program import ConePattern, ConeSolution, ConeValues, SolveStatus
 from dscp_core.cone.solvers import SolverSettings, make_solver
 from dscp_core.errors import InvalidInputError
+from dscp_core.problem import checks
 from dscp_core.scp.stopping import StoppingRule, StoppingTest
 from dscp_core.scp.trace import Iteration, ScpResult, ScpStatus
 from dscp_core.transcription.transcription import Evaluation, Transcription
@@ -81,12 +82,12 @@ class ScpOptions:
     def __post_init__(self) -> None:
         for name in ("cost_tolerance", "defect_tolerance", "virtual_control_tolerance"):
             value = getattr(self, name)
-            if value is not None and not value > 0.0:
-                raise InvalidInputError(name, value, "> 0")
-        if self.max_iterations < 1:
-            raise InvalidInputError("max_iterations", self.max_iterations, ">= 1")
-        if self.fixed_iterations is not None and self.fixed_iterations < 1:
-            raise InvalidInputError("fixed_iterations", self.fixed_iterations, ">= 1")
+            if value is not None:
+                checks.positive(name, value)
+        checks.whole("max_iterations", self.max_iterations, 1)
+        if self.fixed_iterations is not None:
+            checks.whole("fixed_iterations", self.fixed_iterations, 1)
+        object.__setattr__(self, "stopping", checks.choice("stopping", self.stopping, StoppingRule))
         if self.deadline_s is not None and not self.deadline_s > 0.0:
             raise InvalidInputError("deadline_s", self.deadline_s, "> 0")
 

@@ -193,6 +193,18 @@ def test_plans_of_others_are_refused(planners: dict[str, Planner]) -> None:
         descent.gradient("cost", at=planners["powered_descent"].plan())
 
 
+def test_a_method_by_its_name_is_that_method(planners: dict[str, Planner]) -> None:
+    planner = planners["cart"]
+    outcome = planner.plan()
+    for method in Method:
+        by_name = planner.gradient("cost", at=outcome, method=method.value)  # type: ignore[arg-type]
+        expected = planner.gradient("cost", at=outcome, method=method)
+        assert (by_name.method, by_name.iterations) == (method, expected.iterations)
+        assert planner.layer("cost", inputs=("start",), method=method.value)._method is method  # type: ignore[arg-type]
+    with pytest.raises(InvalidInputError, match="method: got 'adjoint'"):
+        planner.gradient("cost", at=outcome, method="adjoint")  # type: ignore[arg-type]
+
+
 def test_only_outcomes_and_losses_are_differentiated(planners: dict[str, Planner]) -> None:
     planner = planners["cart"]
     with pytest.raises(InvalidInputError, match=r"at: got 'a Plan', expected an outcome of plan"):

@@ -265,6 +265,26 @@ def test_ground_is_where_the_landing_site_is() -> None:
     assert ">= 100 m" in outcome.message
 
 
+@pytest.mark.parametrize(
+    ("changes", "field"),
+    [
+        ({"best_effort": "no"}, "best_effort"),
+        ({"options": {"max_iterations": 3}}, "options"),
+        ({"parameters": [1.0]}, "parameters"),
+        ({"hold": "cubic"}, "hold"),
+    ],
+)
+def test_settings_of_another_kind_are_refused(changes: dict[str, Any], field: str) -> None:
+    with pytest.raises(InvalidInputError) as caught:
+        PlannerSettings(**changes)
+    assert caught.value.field == field
+
+
+def test_what_is_no_plan_is_no_warm_start(fixed: Planner) -> None:
+    with pytest.raises(InvalidInputError, match="warm_start: got 'a PlanOutcome'"):
+        fixed.plan(START, warm_start=fixed.plan(START))  # type: ignore[arg-type]
+
+
 @pytest.mark.parametrize("source", [TerminalTime.FIXED, TerminalTime.FREE])
 def test_a_start_outside_the_glideslope_is_told_as_such(
     fixed: Planner, free: Planner, source: TerminalTime

@@ -363,3 +363,24 @@ def test_bad_options(scp: Scp, name: str, value: float) -> None:
 def test_unknown_solver(scp: Scp) -> None:
     with pytest.raises(InvalidInputError, match="mosek"):
         scp.with_options(solver="qoco,mosek")
+
+
+@pytest.mark.parametrize(
+    ("option", "value"),
+    [
+        ("max_iterations", 2.5),
+        ("max_iterations", "3"),
+        ("fixed_iterations", True),
+        ("cost_tolerance", float("inf")),
+        ("defect_tolerance", "small"),
+        ("stopping", "soon"),
+    ],
+)
+def test_options_of_another_kind_are_refused(option: str, value: object) -> None:
+    with pytest.raises(InvalidInputError) as caught:
+        ScpOptions(**{option: value})  # type: ignore[arg-type]
+    assert caught.value.field == option
+
+
+def test_a_stopping_rule_by_its_name_is_that_rule() -> None:
+    assert ScpOptions(stopping="cost_change").stopping is StoppingRule.COST_CHANGE  # type: ignore[arg-type]

@@ -18,7 +18,7 @@ from dscp_core import problems
 from dscp_core.errors import InvalidInputError
 from dscp_core.planning.certificate import PlanCertificate, PlanVerifier
 from dscp_core.planning.plan import PlanStatus
-from dscp_core.planning.planner import Planner
+from dscp_core.planning.planner import Planner, PlannerSettings
 from dscp_core.problem.flight import ControlHold
 
 Array = NDArray[np.float64]
@@ -362,6 +362,11 @@ def test_a_vehicle_file_that_is_silent_about_the_dry_mass(tmp_path: Any) -> None
     assert PROBLEM.read_vehicle(silent) == {"thrust_max": 9.0e5, **unknown}
     assert PROBLEM.read_vehicle(said) == {"dry_mass": 2.5e4, "contact_tilt_max": 0.1}
     assert PROBLEM.table.unpack(PROBLEM.pack())["dry_mass"] == 22200.0
+    # What is said elsewhere is not unsaid by a silent file.
+    settings = PlannerSettings(parameters={"dry_mass": 2.4e4}, intervals=4)
+    for file, mass in ((silent, 2.4e4), (said, 2.5e4)):
+        planner = Planner(PROBLEM, settings, vehicle=file)
+        assert PROBLEM.table.unpack(planner.parameters)["dry_mass"] == mass
 
 
 def test_a_plan_that_burns_the_structure_is_not_certified() -> None:
