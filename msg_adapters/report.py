@@ -77,12 +77,14 @@ class CertificateFigures:
         values: What a flight comes to, by name and unit: the misses of this problem, for example
             ``miss_position_m``, and whatever else the certificate knows, such as ``mass_used_kg``.
         checks: Every constraint.
+        unchecked: Names of those that are not imposed, their bound being unknown or infinite.
     """
 
     passed: bool
     reasons: tuple[str, ...]
     values: Mapping[str, float] = field(default_factory=dict)
     checks: tuple[CheckFigures, ...] = ()
+    unchecked: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -258,6 +260,7 @@ def figures_from_certificate(
             )
             for check in certificate.checks
         ),
+        unchecked=tuple(certificate.unchecked),
     )
 
 

@@ -14,7 +14,7 @@ One status per message. Keys without a known value are left out. Keys:
   of each miss of the problem (for a landing ``certificate.miss_position_m`` and
   ``certificate.miss_speed_m_s``) and of whatever else the certificate knows
   (``certificate.mass_used_kg``), ``certificate.check.K.FIELD`` with the fields of
-  `report.CheckFigures` and their ``margin``
+  `report.CheckFigures` and their ``margin``, ``certificate.unchecked.K``
 - after a refusal: ``field``, ``value``, ``bound``
 - with a best effort: ``best_effort.violation.K``, ``best_effort.step.K``; the certificate is its
 """
@@ -50,6 +50,7 @@ _CERTIFICATE = "certificate."
 _PASSED = "certificate.passed"
 _REASON = "certificate.reason."
 _CHECK = "certificate.check."
+_UNCHECKED = "certificate.unchecked."
 _VIOLATION = "best_effort.violation."
 _STEP = "best_effort.step."
 _NUMBERS = (
@@ -152,6 +153,8 @@ def _certificate_pairs(certificate: CertificateFigures) -> Iterator[tuple[str, V
         yield prefix + "margin", check.margin
         yield prefix + "unit", check.unit
         yield prefix + "passed", check.passed
+    for k, name in enumerate(certificate.unchecked):
+        yield f"{_UNCHECKED}{k}", name
 
 
 def report_from_message(message: DiagnosticArray) -> PlanReport:
@@ -224,6 +227,7 @@ def _certificate(reader: KeyValueReader) -> CertificateFigures | None:
             [key for key in reader.texts if not _is_of_certificate_itself(key)],
         ),
         checks=tuple(_checks(reader)),
+        unchecked=_listed(reader, _UNCHECKED),
     )
 
 
@@ -241,7 +245,7 @@ def _best_effort(reader: KeyValueReader) -> BestEffortFigures | None:
 
 
 def _is_of_certificate_itself(key: str) -> bool:
-    return key == _PASSED or key.startswith((_REASON, _CHECK))
+    return key == _PASSED or key.startswith((_REASON, _CHECK, _UNCHECKED))
 
 
 def _checks(reader: KeyValueReader) -> Iterator[CheckFigures]:

@@ -80,6 +80,7 @@ certificates = st.builds(
     reasons=st.lists(TEXT, max_size=3).map(tuple),
     values=st.dictionaries(TEXT.map("miss_{}".format), FINITE, max_size=4),
     checks=st.lists(checks, max_size=3).map(tuple),
+    unchecked=st.lists(TEXT, max_size=3).map(tuple),
 )
 reports = st.builds(
     PlanReport,
@@ -278,6 +279,7 @@ def test_certificate_becomes_figures():
             CheckFigures("miss_speed", 0.25, 0.5, "m/s", 32.0, True),
             CheckFigures("glideslope", None, 0.0, "m", 3.0, False),
         ),
+        ("dry_mass",),
     )
     assert figures_from_certificate(None) is None
 
