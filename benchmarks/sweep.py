@@ -36,7 +36,7 @@ RELATIVE_STEP = 1e-6
 WEIGHT_STEP = 3e-4
 """The same for weights, on which the mass depends by grams."""
 
-FLOOR_KG = 5e-5
+FLOOR_KG = 3e-5
 """Gradients that change the mass by less than this over one step are measured against this: near
 an optimum the gradient is zero and a relative error means nothing.  The masses of neighbouring runs
 scatter by 2e-11 kg (one standard deviation), so the worst of some hundred differences by 5e-11."""
