@@ -14,7 +14,13 @@ from dscp_core.planning.planner import Planner
 from dscp_core.problems.powered_descent.guidance.gate import PlanRequest
 from dscp_core.problems.powered_descent.guidance.landing import LandingGuidance, Phase
 from dscp_core.problems.powered_descent.guidance.settings import GuidanceSettings
-from dscp_core.problems.powered_descent.truth import Array, TrueMotion, TruthSettings, World
+from dscp_core.problems.powered_descent.truth import (
+    Array,
+    Event,
+    TrueMotion,
+    TruthSettings,
+    World,
+)
 
 _SOON_S = 1e-9
 """Rounding of times."""
@@ -85,8 +91,11 @@ class Flight:
         self._keep(self.world.time_s, self.world.measure(self.world.state[:7]))
         self.commanded.append(self.commanded[-1] if self.commanded else np.zeros(3))
         self.phases.append(self.guidance.phase.value)
+        if self.world.dry_s < math.inf:
+            self.events.append((self.world.dry_s, Event.DRY.value))
         if self.world.landed:
             self.events.append((self.world.time_s, "contact"))
+        self.events.sort(key=lambda event: event[0])
 
     def _guide(self, tick: int, time_s: float) -> None:
         """What guidance does at one tick."""

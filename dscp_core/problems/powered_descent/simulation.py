@@ -23,7 +23,13 @@ from dscp_core.problems.powered_descent.flight import Flight, Replan
 from dscp_core.problems.powered_descent.guidance.landing import Phase
 from dscp_core.problems.powered_descent.guidance.settings import GuidanceSettings
 from dscp_core.problems.powered_descent.guidance.vehicle import Vehicle
-from dscp_core.problems.powered_descent.truth import Array, TrueMotion, TruthSettings, VehicleErrors
+from dscp_core.problems.powered_descent.truth import (
+    Array,
+    Event,
+    TrueMotion,
+    TruthSettings,
+    VehicleErrors,
+)
 
 __all__ = ["DescentRecord", "DescentSimulation", "LandingBounds", "NothingToFlyError", "Replan"]
 
@@ -192,7 +198,9 @@ class DescentSimulation:
             if hover_kg_s > 0.0:
                 figures["excess_hover_s"] = (figures["fuel_kg"] - optimum_kg) / hover_kg_s
         failure = ""
-        if flight.guidance.phase is Phase.WAITING:
+        if flight.world.dry_s < math.inf:
+            failure = Event.DRY.value
+        elif flight.guidance.phase is Phase.WAITING:
             failure = "no first plan"
         elif not flight.world.landed:
             failure = "no contact"

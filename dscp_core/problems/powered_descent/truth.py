@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from enum import Enum
 from typing import Any, ClassVar
 
 import casadi as ca
@@ -142,8 +143,15 @@ class VehicleErrors:
     navigation_bias: Array
 
 
+class Event(Enum):
+    """What ends a stretch of motion early: contact with the ground, or the last propellant."""
+
+    CONTACT = "contact"
+    DRY = "out of propellant"
+
+
 class TrueMotion:
-    """Motion of point mass, engine and attitude by fixed Runge-Kutta steps; contact by event.
+    """Motion of point mass, engine and attitude by fixed Runge-Kutta steps; events by bisection.
 
     The state (11,) is position, velocity, mass, thrust in N, direction of the thrust.
     """
@@ -169,8 +177,9 @@ class TrueMotion:
         parameters: Array,
         duration_s: float,
         ground_m: float,
-    ) -> tuple[float, Array, bool]:
-        """Time flown, state then, and whether that is contact with the ground.
+        dry_kg: float,
+    ) -> tuple[float, Array, Event | None]:
+        """Time flown, state then, and the event that it is, if it is one.
 
         Args:
             state: (11,) at the start, above the ground.
@@ -179,6 +188,7 @@ class TrueMotion:
             parameters: (8,) of `true_parameters`.
             duration_s: How long to fly.
             ground_m: Altitude of the ground.
+            dry_kg: Mass without propellant.
         """
         shortest = min((c for c in parameters[1:3] if c > 0.0), default=math.inf)
         steps = max(1, math.ceil(duration_s / min(_LONGEST_STEP_S, 0.25 * shortest) - 1e-9))
@@ -188,16 +198,22 @@ class TrueMotion:
             def after(part: float, start: Array = state) -> Array:
                 return self._step(start, command, wind, parameters, np.array([part]))[0]
 
-            end = after(step)
-            lowest = step
+            end, end_s = after(step), step
+            dry = state[_MASS] > dry_kg >= end[_MASS]
+            if dry:
+                end_s = _root(lambda part: dry_kg - after(part)[_MASS], step)
+                end = after(end_s)
+            low, low_s = end, end_s
             if end[0] > ground_m and state[3] < 0.0 < end[3]:  # it may dip below in between
-                lowest = _root(lambda part: after(part)[3], step)
-                end = after(lowest) if after(lowest)[0] <= ground_m else end
-            if end[0] <= ground_m:
-                part = _root(lambda part: ground_m - after(part)[0], lowest)
-                return number * step + part, after(part), True
+                low_s = _root(lambda part: after(part)[3], end_s)
+                low = after(low_s)
+            if low[0] <= ground_m:
+                part = _root(lambda part: ground_m - after(part)[0], low_s)
+                return number * step + part, after(part), Event.CONTACT
+            if dry:
+                return number * step + end_s, end, Event.DRY
             state = end
-        return duration_s, state, False
+        return duration_s, state, None
 
 
 def _root(rising: Any, end: float) -> float:
@@ -249,7 +265,16 @@ def _rates(x: ca.SX, u: ca.SX, wind: ca.SX, p: ca.SX) -> ca.SX:
 
 
 class World:
-    """One flight's truth: the errors drawn, the vehicle's motion, what navigation tells."""
+    """One flight's truth: the errors drawn, the vehicle's motion, what navigation tells.
+
+    Attributes:
+        errors: What was drawn.
+        planner: Random numbers of the planner's delays.
+        time_s: Now.
+        state: (11,) of `TrueMotion` now.
+        landed: Whether there was contact.
+        dry_s: When the last propellant was burnt, after which there is no thrust; infinite before.
+    """
 
     def __init__(
         self, motion: TrueMotion, values: Mapping[str, Any], truth: TruthSettings, seed: int
@@ -281,9 +306,11 @@ class World:
         self._parameters = true_parameters(values, truth, self.errors.specific_impulse)
         self._wind = truth.wind_m_s2 * self._air.standard_normal(3)
         self._command = np.array([0.0, 1.0, 0.0, 0.0])
+        self._dry_kg = float(values["dry_mass"])
         self.time_s = 0.0
         self.state = np.concatenate([nominal + self.errors.initial_state, self._command])
         self.landed = False
+        self.dry_s = 0.0 if self.state[_MASS] <= self._dry_kg else math.inf
 
     @property
     def thrust(self) -> Array:
@@ -293,7 +320,7 @@ class World:
 
     def set_command(self, force: Array | None) -> None:
         """The command (3,) in N that now reaches the engine; None switches it off."""
-        if force is None:
+        if force is None or self.dry_s < math.inf:
             self._command = np.concatenate([[0.0], self._command[1:4]])
         else:
             about_y, about_z = self.errors.thrust_direction_rad
@@ -310,13 +337,22 @@ class World:
 
     def fly(self, until_s: float) -> bool:
         """Fly on, at most to the ground; whether it is still in the air."""
-        if self.landed or until_s <= self.time_s:
-            return not self.landed
-        duration_s = until_s - self.time_s
-        flown_s, self.state, self.landed = self._motion.fly(
-            self.state, self._command, self._wind, self._parameters, duration_s, self._ground_m
-        )
-        self.time_s = self.time_s + flown_s if self.landed else until_s
+        while not self.landed and self.time_s < until_s:
+            flown_s, self.state, event = self._motion.fly(
+                self.state,
+                self._command,
+                self._wind,
+                self._parameters,
+                until_s - self.time_s,
+                self._ground_m,
+                self._dry_kg,
+            )
+            self.time_s = until_s if event is None else self.time_s + flown_s
+            self.landed = event is Event.CONTACT
+            if event is Event.DRY:
+                self.dry_s = self.time_s
+                self.state[_THRUST] = 0.0
+                self.set_command(None)
         return not self.landed
 
     def blow(self, for_s: float) -> None:

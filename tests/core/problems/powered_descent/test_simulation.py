@@ -140,6 +140,17 @@ def test_without_any_plan_it_falls_and_says_why() -> None:
     assert summary.figures["contact_speed_m_s"] > 100.0
 
 
+def test_propellant_that_runs_out_is_a_failure_of_its_own() -> None:
+    """The plan ends with 80 kg left, and guidance burns more than its plan."""
+    record = DescentSimulation(planner(dry_mass=31680.0), {"replan_s": 2.0}).record(1)
+    assert record.summary.failure == "out of propellant"
+    assert record.states[-1, 6] == pytest.approx(31680.0, abs=1e-6)
+    dry_s = next(time_s for time_s, text in record.events if text == "out of propellant")
+    assert dry_s < record.times_s[-1]
+    off = np.linalg.norm(record.controls[record.times_s > dry_s], axis=1)
+    assert np.all(off == 0.0)
+
+
 def test_a_refused_plan_is_flown_through() -> None:
     """An engine weaker than assumed, and plans without a reserve."""
     options = {"thrust_scale": 0.02, "reserve": 0.0, "early_reserve": 0.0, "replan_s": 3.0}

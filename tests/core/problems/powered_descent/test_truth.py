@@ -9,6 +9,7 @@ import scipy.integrate
 from dscp_core import problems
 from dscp_core.errors import InvalidInputError
 from dscp_core.problems.powered_descent.truth import (
+    Event,
     TrueMotion,
     TruthSettings,
     World,
@@ -68,8 +69,8 @@ def test_the_motion_and_its_contact_are_those_of_an_independent_integrator(
     parameters = true_parameters(VALUES, truth, 0.0)
     expected = independent(state, command, wind, truth, 5.0)
     assert expected.status == 1
-    flown_s, end, landed = MOTION.fly(state, command, wind, parameters, 5.0, 0.0)
-    assert landed
+    flown_s, end, event = MOTION.fly(state, command, wind, parameters, 5.0, 0.0, 0.0)
+    assert event is Event.CONTACT
     assert flown_s == pytest.approx(expected.t[-1], abs=2e-6)
     scale = np.array([1.0] * 6 + [1e3, 1e5, 1.0, 1.0, 1.0])
     assert np.all(np.abs(end - expected.y[:, -1]) <= 2e-5 * scale)
@@ -84,10 +85,36 @@ def test_a_touch_within_a_step_is_contact() -> None:
     for altitude, touches in ((1.24e-4, True), (1.26e-4, False)):
         state = np.array([altitude, 0, 0, -0.1, 0, 0, 10000.0, thrust, *UP])
         command = np.array([thrust, *UP])
-        flown_s, end, landed = MOTION.fly(state, command, np.zeros(3), parameters, 0.0125, 0.0)
-        assert landed is touches
+        flown_s, end, event = MOTION.fly(state, command, np.zeros(3), parameters, 0.0125, 0.0, 0.0)
+        assert event is (Event.CONTACT if touches else None)
         assert end[3] < 0.0 if touches else end[3] > 0.3
         assert (flown_s < 0.0025) is touches
+
+
+def test_the_engine_stops_where_the_last_propellant_is_burnt() -> None:
+    """From that moment on it falls, whatever is commanded."""
+    values = {**VALUES, "dry_mass": 37000.0}
+    truth = TruthSettings(dispersion=0.0, wind_m_s2=0.0, lag_s=0.0)
+    world = World(MOTION, values, truth, seed=1)
+    world.set_command(np.array([500e3, 0.0, 0.0]))
+    exhaust = 282.0 * 9.80655
+    assert world.fly(6.0)
+    assert world.dry_s == pytest.approx(1000.0 * exhaust / 500e3)
+    assert world.state[3] == pytest.approx(-150.0 + exhaust * math.log(38.0 / 37.0) - 6.0 * 9.80655)
+    world.set_command(np.array([500e3, 0.0, 0.0]))
+    assert world.fly(7.0)
+    assert np.linalg.norm(world.thrust) == 0.0
+    assert world.state[6] == pytest.approx(37000.0, abs=1e-6)
+
+
+def test_propellant_that_ends_after_contact_in_the_same_step_is_contact() -> None:
+    parameters = true_parameters(VALUES, TruthSettings(), 0.0)
+    state = np.array([0.05, 0, 0, -10.0, 0, 0, 30000.0, 500e3, *UP])
+    command = np.array([500e3, *UP])
+    for dry_kg, expected in ((29999.5, Event.DRY), (29998.5, Event.CONTACT)):  # 0.9 kg until then
+        _, end, event = MOTION.fly(state, command, np.zeros(3), parameters, 0.0125, 0.0, dry_kg)
+        assert event is expected
+        assert bool(end[0] > 1e-3) is (event is Event.DRY)
 
 
 def test_the_engine_keeps_its_bounds_and_shows_its_errors() -> None:
