@@ -27,7 +27,8 @@ from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 
 from dscp_core import problems
-from dscp_core.problems.powered_descent.truth import TrueMotion, TruthSettings, World
+from dscp_core.problems.powered_descent.motion import TrueMotion
+from dscp_core.problems.powered_descent.truth import TruthSettings, World
 from dscp_ros.cli import ExitCode
 from dscp_ros.cli.main import main
 from msg_adapters.guidance import GuidanceStatus, guidance_status_from_message

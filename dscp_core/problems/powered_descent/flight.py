@@ -14,13 +14,8 @@ from dscp_core.planning.planner import Planner
 from dscp_core.problems.powered_descent.guidance.gate import PlanRequest
 from dscp_core.problems.powered_descent.guidance.landing import LandingGuidance, Phase
 from dscp_core.problems.powered_descent.guidance.settings import GuidanceSettings
-from dscp_core.problems.powered_descent.truth import (
-    Array,
-    Event,
-    TrueMotion,
-    TruthSettings,
-    World,
-)
+from dscp_core.problems.powered_descent.motion import Array, Event, TrueMotion
+from dscp_core.problems.powered_descent.truth import TruthSettings, World
 
 _SOON_S = 1e-9
 """Rounding of times."""

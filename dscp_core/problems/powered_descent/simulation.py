@@ -23,13 +23,8 @@ from dscp_core.problems.powered_descent.flight import Flight, Replan
 from dscp_core.problems.powered_descent.guidance.landing import Phase
 from dscp_core.problems.powered_descent.guidance.settings import GuidanceSettings
 from dscp_core.problems.powered_descent.guidance.vehicle import Vehicle
-from dscp_core.problems.powered_descent.truth import (
-    Array,
-    Event,
-    TrueMotion,
-    TruthSettings,
-    VehicleErrors,
-)
+from dscp_core.problems.powered_descent.motion import Array, Event, TrueMotion
+from dscp_core.problems.powered_descent.truth import TruthSettings, VehicleErrors
 
 __all__ = ["DescentRecord", "DescentSimulation", "LandingBounds", "NothingToFlyError", "Replan"]
 
@@ -84,9 +79,9 @@ class DescentSimulation:
                 `TruthSettings` and `LandingBounds`.
 
         Raises:
-            InvalidInputError: An unknown option, a bad value, or thrust that does not carry the
-                vehicle.
-            NothingToFlyError: There is no plan from the nominal start.
+            InvalidInputError: An unknown option, a bad value, or an engine that does not carry the
+                vehicle, be it as assumed or as it truly is.
+            NothingToFlyError: There is no other reason why there is no plan from the nominal start.
         """
         chosen = _sorted(options or {})
         self._options = dict(options or {})
@@ -97,10 +92,14 @@ class DescentSimulation:
         self.truth = TruthSettings.suited(self.values, **chosen[TruthSettings])
         self.bounds = LandingBounds(**chosen[LandingBounds])
         self.figures = _figures(self.bounds)
-        nominal = self.planner.plan()
+        vehicle, nominal = Vehicle.of(self.values), self.planner.plan()
         if nominal.plan is None or not (nominal.certified or nominal.converged):
+            vehicle.require_carries(float(self.values["initial_mass"]), "at the start")
             raise NothingToFlyError(nominal.headline)
         self._landing_kg = float(nominal.plan.states[-1, _MASS])
+        self.truth.require_carries(
+            self._landing_kg * vehicle.gravity_m_s2, nominal.plan.terminal_time_s
+        )
         self._longest_s = 3.0 * nominal.plan.terminal_time_s + 60.0
         self.guidance = GuidanceSettings.suited(
             self.values, self._landing_kg, **chosen[GuidanceSettings]

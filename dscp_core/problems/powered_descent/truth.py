@@ -5,18 +5,23 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from enum import Enum
 from typing import Any, ClassVar
 
-import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
 from dscp_core.errors import InvalidInputError
 from dscp_core.problem.options import option, validate
-from dscp_core.transcription.compiled import CompiledFunction
-
-Array = NDArray[np.float64]
+from dscp_core.problems.powered_descent.motion import (
+    DIRECTION,
+    LONGEST_STEP_S,
+    MASS,
+    POSITION,
+    THRUST,
+    VELOCITY,
+    Array,
+    Event,
+    TrueMotion,
+)
 
 _PAPER_PATH_M, _PAPER_SPEED_M_S = 5050.0, 222.5
 """Distance of the paper's start from its pad, and sqrt(gravity times that)."""
@@ -74,7 +79,12 @@ class TruthSettings:
         0.1, "s", "Time constant of the thrust's direction, first order.", upper=10.0
     )
     throttle_rate_n_s: float = option(
-        math.inf, "N/s", "Greatest rate of the thrust.", lower=1e-3, infinite=True
+        math.inf,
+        "N/s",
+        "Greatest rate of the thrust.",
+        lower=1e-3,
+        source="thrust_rate_max",
+        infinite=True,
     )
     command_latency_s: float = option(0.02, "s", "From a command to the engine.", upper=10.0)
 
@@ -86,7 +96,11 @@ class TruthSettings:
     outage_start_s: float = option(0.0, "s", "When the planner stops to answer.")
     outage_s: float = option(0.0, "s", "For how long it does.")
 
-    SUITED: ClassVar[tuple[str, ...]] = ("initial_position_m", "initial_velocity_m_s")
+    SUITED: ClassVar[tuple[str, ...]] = (
+        "initial_position_m",
+        "initial_velocity_m_s",
+        "throttle_rate_n_s",
+    )
 
     def __post_init__(self) -> None:
         validate(self)
@@ -94,12 +108,18 @@ class TruthSettings:
             value = getattr(self, name)
             if 0.0 < value < _LEAST_LAG_S:
                 raise InvalidInputError(name, value, f"0, or >= {_LEAST_LAG_S:g} s")
+        relative = max(
+            self.initial_mass, self.specific_impulse, self.thrust_scale, self.navigation_mass
+        )
+        if self.dispersion * relative > _MOST_RELATIVE:
+            bound = f"<= {_MOST_RELATIVE / relative:g}, with relative errors of {relative:g}"
+            raise InvalidInputError("dispersion", self.dispersion, bound)
         if math.isfinite(self.throttle_rate_n_s) and self.lag_s == 0.0:
             raise InvalidInputError("lag_s", self.lag_s, "> 0 with a finite throttle_rate_n_s")
 
     @staticmethod
     def suited(values: Mapping[str, Any], **changes: float) -> TruthSettings:
-        """Errors of the start that suit a vehicle and its mission.
+        """Errors of the start that suit a vehicle and its mission, and its own throttle rate.
 
         Args:
             values: Parameters of powered descent by name, SI.
@@ -110,18 +130,35 @@ class TruthSettings:
         """
         path = np.asarray(values["initial_position"]) - np.asarray(values["final_position"])
         distance_m = float(np.linalg.norm(path))
-        speed_m_s = math.sqrt(float(values["gravity"]) * distance_m)
+        gravity_m_s2, mass_kg = float(values["gravity"]), float(values["initial_mass"])
+        speed_m_s = math.sqrt(gravity_m_s2 * distance_m)
         own = {
             "initial_position_m": 50.0 * distance_m / _PAPER_PATH_M,
             "initial_velocity_m_s": 3.0 * speed_m_s / _PAPER_SPEED_M_S,
+            "throttle_rate_n_s": float(values["thrust_rate_max"]),
         }
-        return replace(TruthSettings(), **(own | changes))
+        truth = replace(TruthSettings(), **(own | changes))
+        fastest_m_s = float(np.linalg.norm(values["initial_velocity"])) + 1.5 * speed_m_s
+        per_area = truth.air_density_kg_m3 * fastest_m_s * LONGEST_STEP_S / mass_kg
+        if truth.drag_area_m2 * per_area > 1.0:
+            bound = f"<= {1.0 / per_area:.3g} m^2, for air that does not stop it at once"
+            raise InvalidInputError("drag_area_m2", truth.drag_area_m2, bound)
+        return truth
+
+    def require_carries(self, weight_n: float, within_s: float) -> None:
+        """Refuse an engine that would not carry the vehicle by the end of its flight.
+
+        Raises:
+            InvalidInputError: Its thrust rises too slowly.
+        """
+        if self.throttle_rate_n_s * within_s < weight_n:
+            bound = f">= {weight_n / within_s:g} N/s, to reach the weight within {within_s:.3g} s"
+            raise InvalidInputError("throttle_rate_n_s", self.throttle_rate_n_s, bound)
 
 
 _LEAST_LAG_S = 0.005
-_LONGEST_STEP_S = 0.0125
-_POSITION, _VELOCITY = slice(0, 3), slice(3, 6)
-_MASS, _THRUST, _DIRECTION = 6, 7, slice(8, 11)
+_MOST_RELATIVE = 0.2
+"""Of a relative error (sigma), beyond which masses and the like are drawn below zero."""
 
 
 @dataclass(frozen=True)
@@ -143,92 +180,6 @@ class VehicleErrors:
     navigation_bias: Array
 
 
-class Event(Enum):
-    """What ends a stretch of motion early: contact with the ground, or the last propellant."""
-
-    CONTACT = "contact"
-    DRY = "out of propellant"
-
-
-class TrueMotion:
-    """Motion of point mass, engine and attitude by fixed Runge-Kutta steps; events by bisection.
-
-    The state (11,) is position, velocity, mass, thrust in N, direction of the thrust.
-    """
-
-    def __init__(self) -> None:
-        """Compile the equations of motion, once for any vehicle and flight."""
-        x, u, wind = ca.SX.sym("x", 11), ca.SX.sym("u", 4), ca.SX.sym("wind", 3)
-        p, step = ca.SX.sym("p", 8), ca.SX.sym("step")
-        rate = ca.Function("rate", [x, u, wind, p], [_rates(x, u, wind, p)])
-        half = 0.5 * step
-        k1 = rate(x, u, wind, p)
-        k2 = rate(x + half * k1, u, wind, p)
-        k3 = rate(x + half * k2, u, wind, p)
-        k4 = rate(x + step * k3, u, wind, p)
-        after = x + step / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
-        self._step = CompiledFunction("step", [x, u, wind, p, step], [after])
-
-    def fly(
-        self,
-        state: Array,
-        command: Array,
-        wind: Array,
-        parameters: Array,
-        duration_s: float,
-        ground_m: float,
-        dry_kg: float,
-    ) -> tuple[float, Array, Event | None]:
-        """Time flown, state then, and the event that it is, if it is one.
-
-        Args:
-            state: (11,) at the start, above the ground.
-            command: (4,) thrust in N and direction that the engine goes for.
-            wind: (3,) acceleration, m/s^2.
-            parameters: (8,) of `true_parameters`.
-            duration_s: How long to fly.
-            ground_m: Altitude of the ground.
-            dry_kg: Mass without propellant.
-        """
-        shortest = min((c for c in parameters[1:3] if c > 0.0), default=math.inf)
-        steps = max(1, math.ceil(duration_s / min(_LONGEST_STEP_S, 0.25 * shortest) - 1e-9))
-        step = duration_s / steps
-        for number in range(steps):
-
-            def after(part: float, start: Array = state) -> Array:
-                return self._step(start, command, wind, parameters, np.array([part]))[0]
-
-            end, end_s = after(step), step
-            dry = state[_MASS] > dry_kg >= end[_MASS]
-            if dry:
-                end_s = _root(lambda part: dry_kg - after(part)[_MASS], step)
-                end = after(end_s)
-            low, low_s = end, end_s
-            if end[0] > ground_m and state[3] < 0.0 < end[3]:  # it may dip below in between
-                low_s = _root(lambda part: after(part)[3], end_s)
-                low = after(low_s)
-            if low[0] <= ground_m:
-                part = _root(lambda part: ground_m - after(part)[0], low_s)
-                return number * step + part, after(part), Event.CONTACT
-            if dry:
-                return number * step + end_s, end, Event.DRY
-            state = end
-        return duration_s, state, None
-
-
-def _root(rising: Any, end: float) -> float:
-    """Where a function that goes from below zero to above does so, to rounding."""
-    low, high = 0.0, end
-    while True:
-        middle = 0.5 * (low + high)
-        if not low < middle < high:
-            return high
-        if rising(middle) >= 0.0:
-            high = middle
-        else:
-            low = middle
-
-
 def true_parameters(values: Mapping[str, Any], truth: TruthSettings, isp_error: float) -> Array:
     """Parameters (8,) of the true motion."""
     impulse_s = float(values["specific_impulse"]) * (1.0 + isp_error)
@@ -243,24 +194,6 @@ def true_parameters(values: Mapping[str, Any], truth: TruthSettings, isp_error: 
             truth.scale_height_m,
             float(np.atleast_1d(values["final_position"])[0]),
         ]
-    )
-
-
-def _rates(x: ca.SX, u: ca.SX, wind: ca.SX, p: ca.SX) -> ca.SX:
-    exhaust, lag, response, most, gravity, drag, thins, ground = ca.vertsplit(p)
-    velocity, mass, thrust, direction = x[_VELOCITY], x[_MASS], x[_THRUST], x[_DIRECTION]
-    ahead = direction / ca.sqrt(ca.sumsqr(direction))
-    speed = ca.sqrt(ca.sumsqr(velocity) + 1e-30)
-    air = drag * ca.exp(-(x[0] - ground) / thins) * speed * velocity
-    acceleration = (thrust * ahead - air) / mass + wind - ca.vertcat(gravity, 0, 0)
-    change = ca.fmin(ca.fmax((u[0] - thrust) / ca.fmax(lag, 1e-9), -most), most)
-    turn = (u[1:4] - direction) / ca.fmax(response, 1e-9)
-    return ca.vertcat(
-        velocity,
-        acceleration,
-        -thrust / exhaust,
-        ca.if_else(lag > 0, change, 0),
-        ca.if_else(response > 0, turn, ca.DM.zeros(3)),
     )
 
 
@@ -289,7 +222,7 @@ class World:
         spread = np.array(
             [truth.initial_position_m] * 3
             + [truth.initial_velocity_m_s] * 3
-            + [truth.initial_mass * nominal[_MASS]]
+            + [truth.initial_mass * nominal[MASS]]
         )
         bias = np.array([truth.navigation_bias_m] * 3 + [truth.navigation_bias_m_s] * 3 + [0.0])
         self.errors = VehicleErrors(
@@ -310,13 +243,13 @@ class World:
         self.time_s = 0.0
         self.state = np.concatenate([nominal + self.errors.initial_state, self._command])
         self.landed = False
-        self.dry_s = 0.0 if self.state[_MASS] <= self._dry_kg else math.inf
+        self.dry_s = 0.0 if self.state[MASS] <= self._dry_kg else math.inf
 
     @property
     def thrust(self) -> Array:
         """Thrust (3,) of the engine now, in N."""
-        direction = self.state[_DIRECTION]
-        return np.asarray(self.state[_THRUST] / np.linalg.norm(direction) * direction)
+        direction = self.state[DIRECTION]
+        return np.asarray(self.state[THRUST] / np.linalg.norm(direction) * direction)
 
     def set_command(self, force: Array | None) -> None:
         """The command (3,) in N that now reaches the engine; None switches it off."""
@@ -330,10 +263,10 @@ class World:
             size = (1.0 + self.errors.thrust) * float(np.linalg.norm(force))
             made = min(max(size, low), high)
             self._command = np.concatenate([[made], turned / np.linalg.norm(turned)])
-            if self.state[_THRUST] == 0.0 or self._truth.attitude_response_s == 0.0:
-                self.state[_DIRECTION] = self._command[1:4]
+            if self.state[THRUST] == 0.0 or self._truth.attitude_response_s == 0.0:
+                self.state[DIRECTION] = self._command[1:4]
         if self._truth.lag_s == 0.0:
-            self.state[_THRUST] = self._command[0]
+            self.state[THRUST] = self._command[0]
 
     def fly(self, until_s: float) -> bool:
         """Fly on, at most to the ground; whether it is still in the air."""
@@ -351,7 +284,7 @@ class World:
             self.landed = event is Event.CONTACT
             if event is Event.DRY:
                 self.dry_s = self.time_s
-                self.state[_THRUST] = 0.0
+                self.state[THRUST] = 0.0
                 self.set_command(None)
         return not self.landed
 
@@ -366,8 +299,8 @@ class World:
     def before_start(self, by_s: float) -> Array:
         """State (7,) some time before the start, the engine being off."""
         state = self.state[:7].copy()
-        state[_POSITION] += by_s * (-state[_VELOCITY] + 0.5 * by_s * self._gravity)
-        state[_VELOCITY] -= by_s * self._gravity
+        state[POSITION] += by_s * (-state[VELOCITY] + 0.5 * by_s * self._gravity)
+        state[VELOCITY] -= by_s * self._gravity
         return state
 
     def measure(self, state: Array) -> Array:
@@ -376,7 +309,7 @@ class World:
         size = np.array(
             [truth.navigation_position_m] * 3
             + [truth.navigation_velocity_m_s] * 3
-            + [truth.navigation_mass * state[_MASS]]
+            + [truth.navigation_mass * state[MASS]]
         )
         noise = truth.dispersion * size * self._navigation.standard_normal(7)
         return np.asarray(state + noise + self.errors.navigation_bias)

@@ -25,6 +25,10 @@ _ANGLE_MARGIN_RAD = 2e-3
 """By which the cone of a plan is wider than the line of sight that it begins on."""
 
 
+_SAME = 1e-3
+"""In m, m/s and kg: what solvers and messages leave of a start."""
+
+
 @dataclass(frozen=True)
 class PlanRequest:
     """What guidance asks a planner for.
@@ -110,14 +114,14 @@ class GatePlanning:
     def take(self, request: PlanRequest, outcome: Answer, now_s: float) -> bool:
         """Take an answer, however late; whether its plan is kept.
 
-        A plan is flown on from where it would be by now. It is refused if it is not certified, is
-        over, or began before the one that is flown. After a refusal the next plan is asked for at
-        once, with less and less of the reserve, at last with none; the old one is flown on
-        meanwhile. What was released comes back little by little.
+        A plan is flown on from where it would be by now. It is refused if it is not certified, does
+        not begin where it was asked for, is over, or began before the one that is flown. After a
+        refusal the next plan is asked for at once, with less and less of the reserve, at last with
+        none; the old one is flown on meanwhile. What was released comes back little by little.
         """
         if self._asked is request:
             self._asked = None
-        if not outcome.certified or outcome.plan is None:
+        if not outcome.certified or outcome.plan is None or not _begins(outcome.plan, request):
             self._refused += 1
             if self._refused < len(_RELEASED):
                 self._next_s = now_s
@@ -152,3 +156,9 @@ class GatePlanning:
             to_go_s = max(self.kept.end_s - start_s, 0.0)
             early *= math.sqrt(to_go_s / max(self.kept.end_s - self._first_start_s, 1e-9))
         return self._settings.reserve + early
+
+
+def _begins(plan: Plan, request: PlanRequest) -> bool:
+    """Whether a plan begins where it was asked for: another vehicle's does not."""
+    start = plan.states[0]
+    return start.shape == request.state.shape and np.allclose(start, request.state, 1e-6, _SAME)

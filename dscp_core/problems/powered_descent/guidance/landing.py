@@ -82,7 +82,7 @@ class LandingGuidance:
         """Take what navigation tells (7,), SI, core axes, of the declared delay ago.
 
         Raises:
-            InvalidInputError: It is not finite, or not after the one before.
+            InvalidInputError: It is not finite, without mass, or not after the one before.
         """
         self.observer.measure(time_s, state)
 
@@ -102,7 +102,7 @@ class LandingGuidance:
         """Thrust (3,) in N to be commanded now, or None while the engine is to be off.
 
         Raises:
-            InvalidInputError: There was no measurement yet.
+            InvalidInputError: There was no measurement yet, none for very long, or a later command.
         """
         now = self.observer.at(time_s + self.settings.known_command_latency_s)
         self.phase = self._next_phase(now)

@@ -13,6 +13,8 @@ from dscp_core.problems.powered_descent.guidance.vehicle import Array, Engine, M
 
 _MOST_STEPS = 100_000
 _SETTLED = 1e-12
+_LONGEST_S = 1000.0
+"""Without a measurement: far longer than any delay or latency."""
 
 
 @lru_cache(maxsize=8)
@@ -58,10 +60,12 @@ class Observer:
         """Take a measurement (7,), SI, that arrives now.
 
         Raises:
-            InvalidInputError: It is not finite, or not after the one before.
+            InvalidInputError: It is not finite, without mass, or not after the one before.
         """
         if state.shape != (7,) or not np.all(np.isfinite(state)):
             raise InvalidInputError("measured state", state.tolist(), "seven finite numbers")
+        if not math.isfinite(time_s):
+            raise InvalidInputError("time of a measurement", time_s, "finite")
         if not state[6] > 0.0:
             raise InvalidInputError("measured mass", float(state[6]), "> 0 kg")
         at_s = time_s - self._delay_s
@@ -86,8 +90,11 @@ class Observer:
             more: Commands that will have come into effect by then, beside those given.
 
         Raises:
-            InvalidInputError: There was no measurement yet.
+            InvalidInputError: There was no measurement yet, or none for very long.
         """
         if self._motion is None:
             raise InvalidInputError("measurements", 0, "one before the state is asked for")
+        if not time_s - self._motion.time_s <= _LONGEST_S:
+            bound = f"at most {_LONGEST_S:g} s after the last measurement"
+            raise InvalidInputError("time", time_s, bound)
         return self._engine.advance(self._motion, time_s, self.bias, more)

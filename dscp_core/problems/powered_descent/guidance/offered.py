@@ -12,7 +12,7 @@ from dscp_core.problem.options import declared
 from dscp_core.problem.parameters import Parameter, ParameterTable
 from dscp_core.problems.powered_descent.guidance.landing import LandingGuidance
 from dscp_core.problems.powered_descent.guidance.settings import GuidanceSettings
-from dscp_core.problems.powered_descent.guidance.vehicle import Array
+from dscp_core.problems.powered_descent.guidance.vehicle import Array, Vehicle
 
 _TOLD_BY_STAMPS = "known_delay_s"
 
@@ -45,11 +45,12 @@ class LandingGuidances:
         """
         table = ParameterTable(self.settings)
         chosen = {table[name].name: value for name, value in settings.items()}
-        nominal = planner.plan(state)
+        nominal, values = planner.plan(state), planner.problem.table.unpack(planner.parameters)
         if nominal.plan is None or not (nominal.certified or nominal.converged):
+            Vehicle.of(values).require_carries(float(state[6]), "at the start")
             raise NoLandingError(f"no plan to the pad: {nominal.message}")
-        values = planner.problem.table.unpack(planner.parameters)
+        here = {**values, "initial_position": state[:3]}
         suited = GuidanceSettings.suited(
-            values, float(nominal.plan.states[-1, 6]), **chosen, known_delay_s=0.0
+            here, float(nominal.plan.states[-1, 6]), **chosen, known_delay_s=0.0
         )
         return LandingGuidance(values, suited, planner.settings.hold)

@@ -13,6 +13,7 @@ from dscp_core.problems.powered_descent.guidance.vehicle import Vehicle
 
 _DEGREE = math.pi / 180.0
 _EARTH_M_S2 = 9.80665
+_LEAST_GATE_M = 0.5
 _TUNED = "campaigns of the paper's vehicle"
 _SCALED = f"{_TUNED}; `suited` scales it"
 
@@ -49,22 +50,35 @@ class GuidanceSettings:
         0.1, "1", "Part of a mass measurement's surprise that is believed.", upper=1.0
     )
     known_delay_s: float = option(
-        0.05, "s", "Age of a measurement when it arrives.", source="declared"
+        0.05, "s", "Age of a measurement when it arrives.", upper=10.0, source="declared"
     )
     known_command_latency_s: float = option(
-        0.02, "s", "From a command to its effect at the engine.", source="declared"
+        0.02, "s", "From a command to its effect at the engine.", upper=10.0, source="declared"
     )
     known_lag_s: float = option(
-        0.1, "s", "Time constant of the thrust's size, first order.", source="declared"
+        0.1, "s", "Time constant of the thrust's size, first order.", upper=10.0, source="declared"
     )
     known_attitude_response_s: float = option(
-        0.1, "s", "Time constant of the thrust's direction, first order.", source="declared"
+        0.1,
+        "s",
+        "Time constant of the thrust's direction, first order.",
+        upper=10.0,
+        source="declared",
     )
     known_throttle_rate_n_s: float = option(
-        math.inf, "N/s", "Greatest rate of the thrust.", infinite=True, source="declared"
+        math.inf,
+        "N/s",
+        "Greatest rate of the thrust.",
+        lower=1e-3,
+        infinite=True,
+        source="`suited` takes thrust_rate_max",
     )
     known_planning_latency_s: float = option(
-        0.02, "s", "From a request to its plan; rounded up to ticks.", source="declared"
+        0.02,
+        "s",
+        "From a request to its plan; rounded up to ticks.",
+        upper=100.0,
+        source="declared",
     )
 
     replan_s: float = option(1.0, "s", "From one plan to the next.", lower=1e-3, source=_TUNED)
@@ -146,6 +160,7 @@ class GuidanceSettings:
 
     SUITED: ClassVar[tuple[str, ...]] = (
         "tick_s",
+        "known_throttle_rate_n_s",
         "floor_reserve",
         "gate_altitude_m",
         "profile_deceleration_m_s2",
@@ -195,15 +210,14 @@ class GuidanceSettings:
             **changes: Other settings by name, which win.
 
         Raises:
-            InvalidInputError: The thrust does not carry the vehicle, or a refused change.
+            InvalidInputError: The thrust does not carry the vehicle, a refused change, or a gate
+                or contact margin above the start.
         """
         vehicle = Vehicle.of(values)
         gravity = vehicle.gravity_m_s2
+        vehicle.require_carries(landing_mass_kg, "at landing")
         most = vehicle.thrust_max_n / landing_mass_kg - gravity
         least = vehicle.thrust_min_n / landing_mass_kg - gravity
-        if most <= 0.0:
-            bound = f"> {landing_mass_kg * gravity:g} N, the weight at landing"
-            raise InvalidInputError("thrust_max", vehicle.thrust_max_n, bound)
         swift = math.sqrt(gravity / _EARTH_M_S2)
         if least < -0.05 * gravity:
             own = {"profile_deceleration_m_s2": min(0.41 * gravity, 0.35 * most)}
@@ -221,10 +235,17 @@ class GuidanceSettings:
             }
         lasts_s = 1.7 / swift
         gate_m = 0.12 + 0.5 * own["profile_deceleration_m_s2"] * lasts_s**2
+        height_m = float(values["initial_position"][0]) - float(vehicle.pad_m[0])
+        gate_m = min(gate_m, max(0.5 * height_m, _LEAST_GATE_M))
         own |= {
             "gate_altitude_m": gate_m,
+            "known_throttle_rate_n_s": vehicle.thrust_rate_max_n_s,
             "lateral_position_gain": 0.8 * swift**2,
             "lateral_velocity_gain": 1.6 * swift,
             "tilt_per_altitude_rad_m": 12.0 * _DEGREE / gate_m,
         }
-        return replace(GuidanceSettings(), **(own | changes))
+        suited = replace(GuidanceSettings(), **(own | changes))
+        if suited.gate_altitude_m >= height_m:
+            bound = f"< {height_m:g} m, the start's height above the pad"
+            raise InvalidInputError("gate_altitude_m", suited.gate_altitude_m, bound)
+        return suited

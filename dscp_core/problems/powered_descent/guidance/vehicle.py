@@ -11,6 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dscp_core.errors import InvalidInputError
+
 Array = NDArray[np.float64]
 
 _STEP_S = 0.025
@@ -30,6 +32,7 @@ class Vehicle:
         gravity_m_s2: Downwards.
         pointing_angle_max_rad: Greatest angle of the thrust off the vertical.
         pad_m: (3,) where it lands, x up.
+        thrust_rate_max_n_s: Greatest change of the thrust per time.
     """
 
     thrust_min_n: float
@@ -38,6 +41,7 @@ class Vehicle:
     gravity_m_s2: float
     pointing_angle_max_rad: float
     pad_m: Array
+    thrust_rate_max_n_s: float
 
     @staticmethod
     def of(values: Mapping[str, Any]) -> Vehicle:
@@ -49,7 +53,19 @@ class Vehicle:
             gravity_m_s2=float(values["gravity"]),
             pointing_angle_max_rad=float(values["pointing_angle_max"]),
             pad_m=np.asarray(values["final_position"], dtype=np.float64),
+            thrust_rate_max_n_s=float(values["thrust_rate_max"]),
         )
+
+    def require_carries(self, mass_kg: float, when: str) -> None:
+        """Refuse a vehicle that is heavier than its thrust.
+
+        Raises:
+            InvalidInputError: It is, at this mass.
+        """
+        weight_n = mass_kg * self.gravity_m_s2
+        if self.thrust_max_n <= weight_n:
+            bound = f"> {weight_n:g} N, the weight {when}"
+            raise InvalidInputError("thrust_max", self.thrust_max_n, bound)
 
     def limited(self, force: Array, tilt_max_rad: float) -> Array:
         """The nearest thrust (3,) that may be commanded; the vertical part goes first."""
@@ -114,7 +130,14 @@ class Engine:
         self._forces: list[Array] = []
 
     def command(self, time_s: float, force: Array) -> None:
-        """Remember a command (3,) in N that is given now."""
+        """Remember a command (3,) in N that is given now.
+
+        Raises:
+            InvalidInputError: It is given before an earlier one.
+        """
+        if self._times and time_s + self._latency_s < self._times[-1]:
+            bound = f">= {self._times[-1] - self._latency_s:g} s, that of the one before"
+            raise InvalidInputError("time of a command", time_s, bound)
         self._times.append(time_s + self._latency_s)
         self._forces.append(force)
         if self._times[0] < time_s - 2.0 * _REMEMBERED_S:

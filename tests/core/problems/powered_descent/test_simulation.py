@@ -195,6 +195,14 @@ def test_nothing_to_fly_is_told_at_once() -> None:
         DescentSimulation(doomed)
 
 
+def test_what_cannot_take_off_is_named() -> None:
+    with pytest.raises(InvalidInputError, match=r"thrust_max: got 300000.0, expected > 372649 N"):
+        DescentSimulation(planner(thrust_max=300e3))
+    slow = r"throttle_rate_n_s: got 1000.0, expected >= 9\d\d\d.* N/s, to reach the weight"
+    with pytest.raises(InvalidInputError, match=slow):
+        DescentSimulation(planner(), {"throttle_rate_n_s": 1e3})
+
+
 def test_options_are_known_by_name() -> None:
     names = [option.name for option in OPTIONS]
     assert len(set(names)) == len(names)

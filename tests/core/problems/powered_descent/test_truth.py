@@ -8,13 +8,8 @@ import scipy.integrate
 
 from dscp_core import problems
 from dscp_core.errors import InvalidInputError
-from dscp_core.problems.powered_descent.truth import (
-    Event,
-    TrueMotion,
-    TruthSettings,
-    World,
-    true_parameters,
-)
+from dscp_core.problems.powered_descent.motion import Event, TrueMotion
+from dscp_core.problems.powered_descent.truth import TruthSettings, World, true_parameters
 
 PROBLEM = problems.get("powered_descent")
 VALUES = PROBLEM.table.unpack(PROBLEM.pack({}))
@@ -173,9 +168,11 @@ def test_the_errors_of_the_start_follow_the_mission() -> None:
         ({"lag_s": 1e-4}, "lag_s"),
         ({"lag_s": 0.0, "throttle_rate_n_s": 1e5}, "lag_s"),
         ({"late_plans": 1.5}, "late_plans"),
+        ({"dispersion": 100.0}, "dispersion"),
+        ({"drag_area_m2": 1e6}, "drag_area_m2"),
     ],
 )
 def test_a_bad_truth_is_named(changes: dict[str, float], field: str) -> None:
     with pytest.raises(InvalidInputError) as caught:
-        TruthSettings(**changes)
+        TruthSettings.suited(VALUES, **changes)
     assert caught.value.field == field

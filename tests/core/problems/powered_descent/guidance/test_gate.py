@@ -119,6 +119,18 @@ def test_a_late_plan_is_flown_from_where_it_would_be(
     assert not planning.take(over, outcome, 100.0)
 
 
+def test_a_plan_of_another_vehicle_is_no_answer(
+    planning: GatePlanning, outcome: PlanOutcome
+) -> None:
+    assert outcome.plan is not None
+    heavier = outcome.plan.states + np.array([0.0] * 6 + [100.0])
+    for states in (heavier, outcome.plan.states[:, :5]):
+        foreign = replace(outcome, plan=replace(outcome.plan, states=states))
+        assert not planning.take(ask(planning, 0.0), foreign, 0.1)
+    assert planning.kept is None
+    assert planning.take(ask(planning, 0.2), outcome, 0.3)
+
+
 @pytest.mark.parametrize("hold", list(ControlHold))
 def test_a_plan_is_followed_as_it_was_made(outcome: PlanOutcome, hold: ControlHold) -> None:
     assert outcome.plan is not None

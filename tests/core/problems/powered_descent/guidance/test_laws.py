@@ -11,6 +11,7 @@ from dscp_core.errors import InvalidInputError
 from dscp_core.problems.powered_descent.guidance.laws import profile_thrust
 from dscp_core.problems.powered_descent.guidance.settings import GuidanceSettings
 from dscp_core.problems.powered_descent.guidance.vehicle import Motion, Vehicle
+from dscp_core.problems.powered_descent.truth import TruthSettings
 
 PROBLEM = problems.get("powered_descent")
 VALUES = PROBLEM.table.unpack(PROBLEM.pack({}))
@@ -107,3 +108,18 @@ def test_a_vehicle_that_cannot_hover_has_another_law() -> None:
     assert settings.profile_deceleration_m_s2 > 338080.0 / 24245.0 - VEHICLE.gravity_m_s2
     with pytest.raises(InvalidInputError, match="weight at landing"):
         GuidanceSettings.suited(values, 1e6)
+
+
+def test_the_gate_is_below_the_start() -> None:
+    """Plans to a gate above a start are refused, and without one the vehicle would fall."""
+    low = {**VALUES, "initial_position": (3.0, 0.0, 0.0)}
+    assert GuidanceSettings.suited(low, 31760.0).gate_altitude_m == 1.5
+    with pytest.raises(InvalidInputError, match=r"gate_altitude_m: got 6.0, expected < 3 m"):
+        GuidanceSettings.suited(low, 31760.0, gate_altitude_m=6.0)
+
+
+def test_the_throttle_rate_is_the_vehicles() -> None:
+    slow = {**VALUES, "thrust_rate_max": 4e5}
+    assert GuidanceSettings.suited(slow, 31760.0).known_throttle_rate_n_s == 4e5
+    assert TruthSettings.suited(slow).throttle_rate_n_s == 4e5
+    assert TruthSettings.suited(slow, throttle_rate_n_s=3e5).throttle_rate_n_s == 3e5

@@ -117,3 +117,22 @@ def test_a_measurement_out_of_order_is_refused_and_changes_nothing() -> None:
     with pytest.raises(InvalidInputError, match="mass"):
         observer.measure(1.1, -state)
     assert observer.at(0.95).position == pytest.approx(state[0:3])
+
+
+@pytest.mark.parametrize("time_s", [math.nan, math.inf])
+def test_a_time_that_is_none_is_refused(time_s: float) -> None:
+    settings = GuidanceSettings()
+    observer, state = Observer(settings, engine(settings)), np.full(7, 100.0)
+    with pytest.raises(InvalidInputError, match="time of a measurement"):
+        observer.measure(time_s, state)
+    observer.measure(0.0, state)
+    for late_s in (time_s, 1e9):
+        with pytest.raises(InvalidInputError, match="1000 s after the last measurement"):
+            observer.at(late_s)
+
+
+def test_commands_do_not_go_back_in_time() -> None:
+    driven = engine(GuidanceSettings())
+    driven.command(5.0, np.array([3e5, 0.0, 0.0]))
+    with pytest.raises(InvalidInputError, match=r"time of a command: got 4.9, expected >= 5 s"):
+        driven.command(4.9, np.array([2e5, 0.0, 0.0]))

@@ -49,5 +49,9 @@ def test_what_cannot_be_is_refused(planner: Planner) -> None:
         offered()(planner, state, {"known_delay_s": 0.1})
     with pytest.raises(InvalidInputError, match="contact_margin_m"):
         offered()(planner, state, {"contact_margin_m": 50.0})
+    heavy, low = state * ([1.0] * 6 + [2.4]), np.array([4.0, 0.0, 0.0, -1.0, 0.0, 0.0, 32000.0])
+    with pytest.raises(InvalidInputError, match=r"thrust_max: .* the weight at the start"):
+        offered()(planner, heavy, {})
+    assert offered()(planner, low, {}).settings.gate_altitude_m == 2.0  # below where it is
     with pytest.raises(NoLandingError, match="no plan to the pad"):
         offered()(planner, np.array([300.0, 0.0, 0.0, -150.0, 0.0, 0.0, 38000.0]), {})
