@@ -108,6 +108,7 @@ def run_campaign(
     workers: int | None = None,
     ray_address: str | None = None,
     report: Callable[[int], object] = lambda _: None,
+    restart: bool = False,
 ) -> CampaignResult:
     """Fly what the file does not hold yet.
 
@@ -118,6 +119,7 @@ def run_campaign(
         workers: How many flights at once; None for one per processor.
         ray_address: Of the Ray cluster that computes; None for this machine.
         report: Told how many more flights are done.
+        restart: Forget what the file holds.
 
     Raises:
         InvalidInputError: A setup that cannot be used.
@@ -134,7 +136,7 @@ def run_campaign(
             return SerialEngine(campaign)
         return make_engine(campaign, workers, ray_address)
 
-    result = run_grid(path, setup, [(seed,) for seed in seeds], engine, report)
+    result = run_grid(path, setup, [(seed,) for seed in seeds], engine, report, restart=restart)
     flights = tuple(FlightSummary(**row) for row in result.rows)
     return CampaignResult(simulation, flights, result.kept, result.damaged, digest(setup))
 

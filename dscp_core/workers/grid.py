@@ -7,7 +7,6 @@ its checksum and is computed again.
 
 from __future__ import annotations
 
-import contextlib
 import fcntl
 import hashlib
 import json
@@ -55,6 +54,8 @@ def run_grid(
     items: Sequence[Item],
     make_engine: Callable[[], Engine[Item, Row]],
     report: Callable[[int], object] = lambda _: None,
+    *,
+    restart: bool = False,
 ) -> GridResult:
     """Compute what is not in the file yet.
 
@@ -64,12 +65,13 @@ def run_grid(
         items: What to compute.
         make_engine: Called if anything is left to compute; results are JSON, null for NaN.
         report: Told how many more items are done.
+        restart: Forget what is in the file, whatever it is of.
 
     Raises:
         GridFileError: The file is of something else, cannot be written, or another process is
             writing to it.
     """
-    with _GridFile(path, identity) as file:
+    with _GridFile(path, identity, restart) as file:
         waiting = [item for item in dict.fromkeys(items) if item not in file.rows]
         kept = sum(item in file.rows for item in items)
         report(kept)
@@ -87,8 +89,8 @@ def run_grid(
 class _GridFile:
     """The file, open for as long as nobody else may write to it."""
 
-    def __init__(self, path: Path, identity: Row) -> None:
-        self._path = path
+    def __init__(self, path: Path, identity: Row, restart: bool) -> None:
+        self._path, self._restart = path, restart
         self._identity = json.loads(json.dumps(identity))
         self.rows: dict[Item, Row] = {}
         self.damaged = 0
@@ -101,6 +103,8 @@ class _GridFile:
                 fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
                 raise GridFileError(f"{self._path}: another process is writing to it") from None
+            if self._restart:
+                os.ftruncate(self._descriptor, 0)
             self._load()
         except BaseException:
             os.close(self._descriptor)
@@ -179,9 +183,3 @@ def code_version() -> str:
     for path in sorted(root.rglob("*.py")):
         digest.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes())
     return digest.hexdigest()[:12]
-
-
-def discard(path: Path) -> None:
-    """Remove a file of results, if there is one."""
-    with contextlib.suppress(FileNotFoundError):
-        path.unlink()

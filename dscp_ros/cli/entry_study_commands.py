@@ -194,11 +194,9 @@ def _compute(
     from tqdm import tqdm
 
     from dscp_core.workers.choice import make_engine
-    from dscp_core.workers.grid import code_version, discard, run_grid
+    from dscp_core.workers.grid import code_version, run_grid
 
     path = args.output / name
-    if args.restart:
-        discard(path)
     # disable=None: no bar where stderr is no terminal.
     with tqdm(total=len(items), unit="point", disable=None, smoothing=0.05) as bar:
         result = run_grid(
@@ -207,6 +205,7 @@ def _compute(
             items,
             lambda: make_engine(model, args.jobs, args.ray),
             bar.update,
+            restart=args.restart,
         )
     if result.kept or result.damaged:
         damaged = f", {result.damaged} damaged lines left out" if result.damaged else ""

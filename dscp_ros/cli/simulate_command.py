@@ -226,17 +226,20 @@ def _fly(args: argparse.Namespace, campaign: Campaign) -> None:
     from dscp_core.campaigns.campaign import run_campaign, seeds_of
     from dscp_core.campaigns.documents import document
     from dscp_core.campaigns.statistics import statistics
-    from dscp_core.workers.grid import discard
 
     seeds = seeds_of(args.seed, args.flights)
     path = args.output / FLIGHTS_FILE
-    if args.restart:
-        discard(path)
     started_s = time.perf_counter()
     # disable=None: no bar where stderr is no terminal.
     with tqdm(total=len(seeds), unit="flight", disable=None, smoothing=0.05) as bar:
         result = run_campaign(
-            path, campaign, seeds, workers=args.workers, ray_address=args.ray, report=bar.update
+            path,
+            campaign,
+            seeds,
+            workers=args.workers,
+            ray_address=args.ray,
+            report=bar.update,
+            restart=args.restart,
         )
     wall_s = time.perf_counter() - started_s
     if result.kept or result.damaged:

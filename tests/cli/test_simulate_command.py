@@ -84,6 +84,11 @@ def test_going_on_and_another_setup(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert json.loads(captured.out)["flights"] == FLIGHTS
     assert simulate(tmp_path, "--dispersions", "2") == ExitCode.BAD_INPUT
     assert "truth.dispersion 1.0 there, 2.0 here" in capsys.readouterr().err
+    doomed = ("--restart", "--set", "mass=3", "--truth", "grip=0")
+    assert simulate(tmp_path, *doomed) == ExitCode.BAD_INPUT
+    capsys.readouterr()
+    assert simulate(tmp_path, "--json") == ExitCode.OK
+    assert json.loads(capsys.readouterr().out)["resumed"] == FLIGHTS, "bad input forgets nothing"
     assert simulate(tmp_path, "--dispersions", "2", "--restart", flights=3) == ExitCode.OK
 
 

@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 from study_support import Counting
 
-from dscp_core.workers.grid import GridFileError, GridResult, Item, code_version, discard, run_grid
+from dscp_core.workers.grid import GridFileError, GridResult, Item, code_version, run_grid
 from dscp_core.workers.processes import ProcessEngine, SerialEngine
 
 IDENTITY = {"study": "toy", "tolerance": 1e-3}
@@ -28,8 +28,11 @@ def grid(
     items: list[Item] = ITEMS,
     identity: Mapping[str, object] = IDENTITY,
     report: Callable[[int], object] = lambda _: None,
+    restart: bool = False,
 ) -> GridResult:
-    return run_grid(path, identity, items, lambda: SerialEngine(Counting(log)), report)
+    return run_grid(
+        path, identity, items, lambda: SerialEngine(Counting(log)), report, restart=restart
+    )
 
 
 def evaluated(log: Path) -> list[int]:
@@ -147,17 +150,18 @@ def test_results_of_other_settings_are_not_mixed(path: Path, log: Path) -> None:
     ):
         grid(path, log, identity={"study": "toy", "tolerance": 1e-4, "code": code_version()})
     assert path.read_bytes() == content
-    discard(path)
-    discard(path)
-    assert grid(path, log).kept == 0
+    assert grid(path, log, restart=True).kept == 0
+    assert grid(path, log).kept == len(ITEMS)
 
 
 def test_one_writer_at_a_time(path: Path, log: Path) -> None:
     def report(_: int) -> None:
-        with pytest.raises(GridFileError, match="another process"):
-            grid(path, log)
+        for restart in (False, True):
+            with pytest.raises(GridFileError, match="another process"):
+                grid(path, log, restart=restart)
 
     grid(path, log, ITEMS[:1], report=report)
+    assert grid(path, log, ITEMS[:1]).kept == 1, "nothing was forgotten"
 
 
 def test_full_disk(path: Path, log: Path) -> None:
