@@ -188,8 +188,11 @@ def _run(arguments: list[str]) -> int:
         if extra is None:
             raise
         return _report(MissingExtraError(f"dscp {command}", str(error.name), extra), as_json)
-    except (FileNotFoundError, IsADirectoryError, NotADirectoryError, PermissionError) as error:
-        return _report(FileAccessError(f"{error.filename}: {error.strerror}"), as_json)
+    except OSError as error:
+        if isinstance(error, BrokenPipeError) or error.strerror is None:
+            raise
+        where = "" if error.filename is None else f"{error.filename}: "
+        return _report(FileAccessError(f"{where}{error.strerror}"), as_json)
     except DscpError as error:
         return _report(error, as_json)
 

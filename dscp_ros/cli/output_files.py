@@ -19,14 +19,15 @@ if TYPE_CHECKING:
     from dscp_core.problem.trajectory import Plan
 
 
-def check_folder(path: Path) -> None:
-    """Refuses a place for files that is a file itself.
+def check_folder(path: Path, option: str = "--output") -> None:
+    """Refuses a place for files that is a file itself, or in one.
 
     Raises:
         InvalidInputError: It is.
     """
-    if path.exists() and not path.is_dir():
-        raise InvalidInputError("--output", str(path), "a directory")
+    there = next(part for part in (path, *path.absolute().parents) if os.path.lexists(part))
+    if not there.is_dir():
+        raise InvalidInputError(option, str(path), "a directory")
 
 
 def check_output_path(option: str, path: Path, suffixes: tuple[str, ...]) -> None:

@@ -149,6 +149,8 @@ def run(args: argparse.Namespace) -> int:
     if args.workers is not None and args.workers < 1:
         raise InvalidInputError("--workers", args.workers, ">= 1")
     check_folder(args.output)
+    if args.write_bags is not None:
+        check_folder(args.write_bags, "--write-bags")
     campaign = make_campaign(args)
     with _over_ros(args, campaign) if args.over_ros else nullcontext(campaign) as chosen:
         if args.replay is not None:

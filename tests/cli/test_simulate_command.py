@@ -133,6 +133,9 @@ def test_a_failure_is_flown_again_by_the_command_that_is_printed(
         (("--dispersions", "1", "--truth", "dispersion=1"), "no --truth dispersion beside it"),
         (("--set", "weight=1"), "parameter: got 'weight'"),
         (("--output", "README.md"), "--output: got 'README.md', expected a directory"),
+        (("--output", "README.md/deep/er"), "got 'README.md/deep/er', expected a directory"),
+        (("--output", "x" * 300), "File name too long"),
+        (("--write-bags", "README.md"), "--write-bags: got 'README.md', expected a directory"),
     ],
 )
 def test_bad_input(
