@@ -168,7 +168,7 @@ def judge(figures: Sequence[FlightFigure], flight: FlightSummary) -> FailedFligh
     """
     judged = [figure for figure in figures if figure.judged]
     over = [
-        (flight.figures[figure.name] / figure.most if figure.most > 0.0 else math.inf, figure)
+        (figure.excess_of(flight.figures[figure.name]), figure)
         for figure in judged
         if figure.name in flight.figures and flight.figures[figure.name] > figure.most
     ]

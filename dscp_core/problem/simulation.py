@@ -45,6 +45,10 @@ class FlightFigure:
         """Whether success depends on it."""
         return math.isfinite(self.most)
 
+    def excess_of(self, value: float) -> float:
+        """How many times what it may be a value is; infinite above zero where that is zero."""
+        return value / self.most if self.most > 0.0 else math.inf
+
 
 @dataclass(frozen=True)
 class FlightSummary:
@@ -73,7 +77,7 @@ class FlightSummary:
 def worst_of(figures: tuple[FlightFigure, ...], values: Mapping[str, float]) -> str:
     """Name of the figure furthest above what it may be, relative to that; empty without one."""
     excess = {
-        f.name: values[f.name] / f.most
+        f.name: f.excess_of(values[f.name])
         for f in figures
         if f.name in values and values[f.name] > f.most
     }

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from simulation_support import FIGURES, VALUES, CartSimulation
 
 from dscp_core.campaigns.statistics import judge, mean, quantile, share, statistics
-from dscp_core.problem.simulation import FlightFigure, FlightSummary
+from dscp_core.problem.simulation import FlightFigure, FlightSummary, worst_of
 
 SIMULATION = CartSimulation(1.5, VALUES)
 GOOD = {"stop_speed_m_s": 0.5, "miss_m": 1.0, "energy_j": 2.0, "east_m": 0.0, "north_m": 1.0}
@@ -101,6 +101,17 @@ def test_judgement(
     if failed:
         over = {n: v for n, v in changes.items() if v is not None and n != "energy_j"}
         assert failed.figures == over
+
+
+def test_a_bound_of_zero_is_exceeded_by_anything_above() -> None:
+    figures = tuple(
+        FlightFigure(name, "m", "", most, name) for name, most in (("a", 0.0), ("b", 1.0))
+    )
+    assert worst_of(figures, {"a": 1e-9, "b": 5.0}) == "a"
+    assert worst_of(figures, {"a": 0.0, "b": 1.0}) == ""
+    failed = judge(figures, FlightSummary(1, {"a": 1e-9, "b": 5.0}))
+    assert failed is not None
+    assert failed.classes == ("a", "b")
 
 
 def test_a_bound_without_a_word_is_named_by_its_number() -> None:
