@@ -41,3 +41,7 @@ class InvalidInputError(DscpError, ValueError):
     def __reduce__(self) -> tuple[type[InvalidInputError], tuple[str, Any, str]]:
         """Rebuild from the three parts, not the message: it crosses process boundaries."""
         return type(self), (self.field, self.value, self.bound)
+
+
+class HelperLostError(DscpError):
+    """A process that computes for this one is gone or silent, which says nothing of any result."""

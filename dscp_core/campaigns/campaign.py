@@ -12,7 +12,7 @@ from typing import Any
 
 from dscp_core.campaigns.documents import settings_document
 from dscp_core.campaigns.statistics import ERROR
-from dscp_core.errors import InvalidInputError
+from dscp_core.errors import HelperLostError, InvalidInputError
 from dscp_core.planning.planner import Planner, PlannerSettings
 from dscp_core.problem.declaration import OptimalControlProblem
 from dscp_core.problem.parameters import Value
@@ -127,6 +127,7 @@ def run_campaign(
             another process is writing to it.
         RayMissingError, RayClusterError: No usable cluster at the address.
         WorkerLostError: Workers keep dying.
+        HelperLostError: Whoever plans is gone; the flights before are kept.
     """
     simulation = campaign.simulation()
     setup = identity(campaign, simulation)
@@ -168,9 +169,16 @@ def _flatten(flat: dict[str, Any], prefix: str, settings: Mapping[str, Any]) -> 
 
 
 def fly(simulation: Simulation, seed: int) -> FlightSummary:
-    """One flight, whatever happens in it: an exception is its failure, not the campaign's end."""
+    """One flight, whatever happens in it: an exception is its failure, not the campaign's end.
+
+    Raises:
+        HelperLostError: Whoever plans for it is gone; a campaign goes on when they are back.
+        MemoryError: There is none left.
+    """
     try:
         return finite(simulation.fly(seed))
+    except (HelperLostError, MemoryError):
+        raise
     except Exception as error:  # noqa: BLE001 - one flight of thousands; named with its seed
         text = " ".join(f"{type(error).__name__}: {error}".split())
         return FlightSummary(seed, {}, ERROR, story=text)

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from dscp_core.errors import DscpError
+from dscp_core.errors import HelperLostError
 
 _STOP_S = 10.0
 """Time to end after SIGINT. A plan in hand is finished first, which its deadline bounds."""
@@ -17,7 +17,7 @@ _GRACE_S = 3.0
 _TAIL_LINES = 15
 
 
-class ChildFailedError(DscpError):
+class ChildFailedError(HelperLostError):
     """A child process ended when it should not have, or not as it should have."""
 
 

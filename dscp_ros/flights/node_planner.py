@@ -25,7 +25,7 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory
 
-from dscp_core.errors import DscpError, InvalidInputError
+from dscp_core.errors import HelperLostError, InvalidInputError
 from dscp_core.planning.attempt import Attempt
 from dscp_core.planning.plan import PlanOutcome, PlanStatus
 from dscp_core.planning.planner import Planner, PlannerSettings
@@ -52,7 +52,7 @@ _FIRST_STAMP_NS = nanoseconds_from_seconds(1e6)
 _QUEUE = 10
 
 
-class NodeSilentError(DscpError):
+class NodeSilentError(HelperLostError):
     """The planner node did not answer in time."""
 
 

@@ -12,6 +12,7 @@ from dscp_core.planning.settings import PlannerSettings, TerminalTime
 from dscp_core.workers.grid import GridFileError
 from dscp_ros.cli import ExitCode
 from dscp_ros.cli.main import main
+from dscp_ros.demo.processes import ChildFailedError
 from dscp_ros.flights.node_planner import node_planner
 
 NAME = "powered_descent"
@@ -41,6 +42,20 @@ def test_a_flight_lands_as_it_does_without_ros(tmp_path: Path) -> None:
         assert flight.figures[name] == pytest.approx(alone.figures[name], abs=bound), name
     log = (tmp_path / "planner.log").read_text(encoding="utf-8")
     assert "planner rebuilt with the new parameters" in log, "the node did plan"
+
+
+def test_a_planner_that_dies_ends_the_campaign_and_is_no_failed_flight(tmp_path: Path) -> None:
+    problem, path = problems.get(NAME), tmp_path / "ros.jsonl"
+
+    def fly() -> None:
+        with node_planner(NAME, problem, SETTINGS, tmp_path / "planner.log") as planner:
+            process = planner._link._process._process
+            campaign = Campaign(problem, SETTINGS, {**OPTIONS, "outage_s": 1e3}, planner)
+            run_campaign(path, campaign, [3, 4], report=lambda flown: flown and process.kill())
+
+    with pytest.raises(ChildFailedError):
+        fly()
+    assert len(path.read_text(encoding="utf-8").splitlines()) == 2, "the setup and the first flight"
 
 
 def test_one_process_plans_for_all(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:

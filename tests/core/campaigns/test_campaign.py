@@ -24,7 +24,7 @@ from dscp_core.campaigns.campaign import (
     seeds_of,
 )
 from dscp_core.campaigns.statistics import statistics
-from dscp_core.errors import InvalidInputError
+from dscp_core.errors import HelperLostError, InvalidInputError
 from dscp_core.planning.settings import PlannerSettings
 from dscp_core.problem.parameters import Value
 from dscp_core.problem.simulation import FlightSummary
@@ -125,12 +125,13 @@ def test_a_figure_that_is_no_number_is_a_failure(value: float) -> None:
     assert told == FlightSummary(3, {"a": 1.0}, "error", story=f"b is {value}; rolled")
 
 
-def test_an_interrupt_is_no_failure_of_a_flight() -> None:
+@pytest.mark.parametrize("lost", [KeyboardInterrupt, HelperLostError, MemoryError])
+def test_what_says_nothing_of_a_flight_is_no_failure_of_it(lost: type[BaseException]) -> None:
     class Interrupted(CartSimulation):
         def fly(self, seed: int) -> FlightSummary:
-            raise KeyboardInterrupt
+            raise lost
 
-    with pytest.raises(KeyboardInterrupt):
+    with pytest.raises(lost):
         fly(Interrupted(1.0, {}), 1)
 
 
