@@ -25,6 +25,8 @@ _ANGLE_MARGIN_RAD = 2e-3
 """By which the cone of a plan is wider than the line of sight that it begins on."""
 
 
+_SOON_S = 1e-9
+"""Rounding of times."""
 _SAME = 1e-3
 """In m, m/s and kg: what solvers and messages leave of a start."""
 
@@ -53,7 +55,11 @@ class PlanRequest:
 
 
 class GatePlanning:
-    """Asks for plans, and keeps the one that is flown."""
+    """Asks for plans, and keeps the one that is flown.
+
+    Attributes:
+        kept: The plan that is flown; None before the first.
+    """
 
     def __init__(
         self,
@@ -66,6 +72,7 @@ class GatePlanning:
         self._pad = np.asarray(values["final_position"], dtype=np.float64)
         self._glideslope_rad = float(values["glideslope_angle_max"])
         self.kept: Reference | None = None
+        self._coming: list[Reference] = []
         self._first_start_s = 0.0
         self._asked: PlanRequest | None = None
         self._next_s = -math.inf
@@ -75,11 +82,13 @@ class GatePlanning:
     def due(self, time_s: float) -> bool:
         """Whether a plan should be asked for now."""
         asked = self._asked
-        if asked is not None and time_s < asked.made_at_s + self._settings.answer_timeout_s:
+        settings = self._settings
+        patience_s = max(settings.answer_timeout_s, 2.0 * settings.known_planning_latency_s)
+        if asked is not None and time_s < asked.made_at_s + patience_s:
             return False
         if time_s < self._next_s - 1e-9:
             return False
-        return self.kept is None or self.kept.end_s - time_s >= self._settings.last_replan_s
+        return self.kept is None or self.kept.end_s - time_s >= settings.last_replan_s
 
     def start_s(self, time_s: float) -> float:
         """When a plan that is asked for now can come into effect: at the tick after it came."""
@@ -117,7 +126,8 @@ class GatePlanning:
         A plan is flown on from where it would be by now. It is refused if it is not certified, does
         not begin where it was asked for, is over, or began before the one that is flown. After a
         refusal the next plan is asked for at once, with less and less of the reserve, at last with
-        none; the old one is flown on meanwhile. What was released comes back little by little.
+        none; the old one is flown on meanwhile. What was released comes back little by little. An
+        early plan is flown from its start on.
         """
         if self._asked is request:
             self._asked = None
@@ -129,13 +139,24 @@ class GatePlanning:
         self._level = min(self._level * self._released + _RECOVERED, 1.0)
         self._refused = 0
         reference = Reference(outcome.plan, request.start_s, self._hold)
-        kept = self.kept
-        if reference.end_s <= now_s or (kept is not None and kept.start_s >= reference.start_s):
+        newest = self._coming[-1] if self._coming else self.kept
+        if reference.end_s <= now_s or (newest is not None and newest.start_s >= reference.start_s):
             return False
-        if kept is None:
+        if newest is None:
             self._first_start_s = reference.start_s
-        self.kept = reference
+        self._coming.append(reference)
+        self.switch(now_s + self._settings.known_command_latency_s)
         return True
+
+    def flown_at(self, time_s: float) -> Reference | None:
+        """The plan that will be flown then, as far as is known."""
+        begun = [plan for plan in self._coming if plan.start_s <= time_s + _SOON_S]
+        return begun[-1] if begun else self.kept
+
+    def switch(self, time_s: float) -> None:
+        """From now on fly what is to be flown then, when a command comes into effect."""
+        self.kept = self.flown_at(time_s)
+        self._coming = [plan for plan in self._coming if plan.start_s > time_s + _SOON_S]
 
     def _approach_angle_rad(self, expected: Motion) -> float:
         """Of the cone of the next plan: narrow where possible; after refusals the mission's."""

@@ -105,6 +105,7 @@ class LandingGuidance:
             InvalidInputError: There was no measurement yet, none for very long, or a later command.
         """
         now = self.observer.at(time_s + self.settings.known_command_latency_s)
+        self.planning.switch(now.time_s)
         self.phase = self._next_phase(now)
         if self.phase is Phase.WAITING:
             return None
@@ -151,14 +152,15 @@ class LandingGuidance:
     def _expected(self, time_s: float) -> Motion:
         """The motion when a plan asked for now will start, on what will be commanded until then."""
         settings, latency_s = self.settings, self.settings.known_command_latency_s
-        start_s, kept = self.planning.start_s(time_s), self.planning.kept
+        start_s = self.planning.start_s(time_s)
         more: list[tuple[float, Array]] = []
         tick = 1
-        while kept is not None and time_s + tick * settings.tick_s + latency_s < start_s - 1e-9:
-            effect_s = time_s + tick * settings.tick_s + latency_s
-            _, _, mass = kept.state(effect_s)
-            thrust = kept.thrust(effect_s + settings.known_lag_s, settings.tick_s)
-            scale = self.observer.at(time_s).mass / mass
-            more.append((effect_s, thrust * scale))
+        while (effect_s := time_s + tick * settings.tick_s + latency_s) < start_s - 1e-9:
+            plan = self.planning.flown_at(effect_s)
+            if plan is not None:
+                _, _, mass = plan.state(effect_s)
+                thrust = plan.thrust(effect_s + settings.known_lag_s, settings.tick_s)
+                scale = self.observer.at(time_s).mass / mass
+                more.append((effect_s, thrust * scale))
             tick += 1
         return self.observer.at(start_s, tuple(more))

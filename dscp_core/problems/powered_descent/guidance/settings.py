@@ -86,7 +86,10 @@ class GuidanceSettings:
         1.5, "s", "With less time to the gate, nothing is planned.", source=_TUNED
     )
     answer_timeout_s: float = option(
-        2.0, "s", "After this long without an answer, the next plan is asked for.", lower=1e-3
+        2.0,
+        "s",
+        "After this long, or twice the known latency, without an answer the next is asked for.",
+        lower=1e-3,
     )
     reserve: float = option(
         0.03, "1", "Part of the greatest thrust that every plan leaves.", upper=0.9, source=_TUNED
@@ -126,7 +129,7 @@ class GuidanceSettings:
         4.0, "m/s^2", "Of the last stretch.", lower=1e-3, source=_SCALED
     )
     contact_descent_m_s: float = option(
-        0.25, "m/s", "Descent that the last stretch ends with.", source=_SCALED
+        0.25, "m/s", "Descent that the last stretch ends with.", lower=0.01, source=_SCALED
     )
     contact_margin_m: float = option(
         0.12,

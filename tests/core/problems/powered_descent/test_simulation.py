@@ -133,6 +133,13 @@ def test_two_seconds_without_a_plan_and_late_plans_are_flown_through() -> None:
     assert late.summary.figures["contact_speed_m_s"] < 1.0
 
 
+def test_plans_that_come_early_are_flown_in_time() -> None:
+    early = {"known_planning_latency_s": 0.5, "planning_latency_s": 0.02}
+    summary = DescentSimulation(planner(), early).fly(5)
+    assert summary.success, summary.story
+    assert summary.figures["refused_replans"] == 0.0
+
+
 def test_without_any_plan_it_falls_and_says_why() -> None:
     summary = DescentSimulation(planner(), {"outage_s": 1000.0}).fly(1)
     assert summary.failure == "no first plan"

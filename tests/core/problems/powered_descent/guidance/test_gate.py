@@ -131,6 +131,24 @@ def test_a_plan_of_another_vehicle_is_no_answer(
     assert planning.take(ask(planning, 0.2), outcome, 0.3)
 
 
+def test_early_plans_are_flown_from_their_starts_on(planner: Planner, outcome: PlanOutcome) -> None:
+    values = planner.problem.table.unpack(planner.parameters)
+    slow = replace(SETTINGS, known_planning_latency_s=3.0)
+    planning = GatePlanning(slow, Vehicle.of(values), values, ControlHold.MEAN)
+    starts_s = []
+    for time_s in (0.0, 1.0):
+        request = ask(planning, time_s)
+        starts_s.append(request.start_s)
+        assert planning.take(request, outcome, time_s + 0.1)
+        assert planning.kept is None
+    assert starts_s == pytest.approx([3.02, 4.02])
+    for time_s, expected_s in ((3.0, None), (3.02, 3.02), (4.0, 3.02), (4.02, 4.02)):
+        foreseen = planning.flown_at(time_s)
+        planning.switch(time_s)
+        assert planning.kept is foreseen
+        assert (foreseen and foreseen.start_s) == pytest.approx(expected_s)
+
+
 @pytest.mark.parametrize("hold", list(ControlHold))
 def test_a_plan_is_followed_as_it_was_made(outcome: PlanOutcome, hold: ControlHold) -> None:
     assert outcome.plan is not None

@@ -86,6 +86,8 @@ def test_every_command_can_be_given() -> None:
         ({"reserve": 0.6, "early_reserve": 0.5}, "early_reserve"),
         ({"contact_margin_m": 7.0}, "contact_margin_m"),
         ({"position_noise_m": -1.0}, "position_noise_m"),
+        ({"contact_descent_m_s": 0.0}, "contact_descent_m_s"),  # it would hover for good
+        ({"known_delay_s": 1e5}, "known_delay_s"),
     ],
 )
 def test_bad_settings_are_named(changes: dict[str, float], field: str) -> None:
