@@ -122,6 +122,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         _require_positive("--rate", rate)
         _require_positive("--timeout", args.timeout)
         if args.campaign is not None:
+            if args.loop or args.bag:
+                raise InvalidInputError("--campaign", args.campaign, "neither --loop nor --bag")
             return _fly(args.problem, args.campaign, args.output)
         if args.loop:
             return _run_loop(args.output, args.bag, args.epochs, args.rate, args.timeout)

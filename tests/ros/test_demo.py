@@ -239,10 +239,12 @@ def test_time_that_is_up_is_said(tmp_path: Path) -> None:
         ("--rate", "0", "rate"),
         ("--rate", "nan", "rate"),
         ("--timeout", "-1", "timeout"),
+        ("--campaign", "0", "flights: got 0"),
+        ("--campaign", "2 --loop", "neither --loop nor --bag"),
     ],
 )
 def test_bad_options_are_named(tmp_path: Path, option: str, value: str, said: str) -> None:
-    with running(tmp_path / "out", option, value) as demo:
+    with running(tmp_path / "out", option, *value.split()) as demo:
         assert demo.finish() == ExitCode.BAD_INPUT
     assert said in demo.text
     assert not (tmp_path / "out").exists()
