@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticArray
 
 from msg_adapters.errors import InputCode, RejectedInputError
-from msg_adapters.key_values import KeyValueReader, key_values
-from msg_adapters.stamps import nanoseconds_from_stamp, stamp_from_nanoseconds
+from msg_adapters.key_values import KeyValueReader, message_of_status
+from msg_adapters.stamps import nanoseconds_from_stamp
 
 _REJECTED = "rejected."
 
@@ -58,18 +58,14 @@ def message_from_health(
         *((_REJECTED + name, count) for name, count in health.rejected.items()),
         *((key, getattr(health, key)) for key in _NUMBERS),
     ]
-    message = DiagnosticArray()
-    message.header.stamp = stamp_from_nanoseconds(stamp_ns)
-    message.status = [
-        DiagnosticStatus(
-            level=bytes([health.level]),
-            name=f"{node}: health",
-            message=health.message,
-            hardware_id=problem,
-            values=key_values(pairs),
-        )
-    ]
-    return message
+    return message_of_status(
+        pairs,
+        stamp_ns=stamp_ns,
+        level=bytes([health.level]),
+        name=f"{node}: health",
+        message=health.message,
+        problem=problem,
+    )
 
 
 def health_from_message(message: DiagnosticArray, *, node: str) -> tuple[Health, int]:

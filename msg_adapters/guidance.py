@@ -11,12 +11,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import WrenchStamped
 
-from msg_adapters.checks import require_finite, require_length
+from msg_adapters.checks import require_finite
 from msg_adapters.frames import Array
-from msg_adapters.key_values import KeyValueReader, key_values
+from msg_adapters.key_values import KeyValueReader, message_of_status, only_status
 from msg_adapters.layout import StateLayout
 from msg_adapters.stamps import nanoseconds_from_stamp, stamp_from_nanoseconds, stamp_text
 
@@ -72,18 +72,14 @@ def message_from_guidance_status(
         ("state_age_s", status.state_age_s),
         *((key, None if ns is None else stamp_text(ns)) for key, ns in stamps.items()),
     ]
-    message = DiagnosticArray()
-    message.header.stamp = stamp_from_nanoseconds(status.stamp_ns)
-    message.status = [
-        DiagnosticStatus(
-            level=bytes([status.level]),
-            name=f"{node}: status",
-            message=status.message,
-            hardware_id=problem,
-            values=key_values(pairs),
-        )
-    ]
-    return message
+    return message_of_status(
+        pairs,
+        stamp_ns=status.stamp_ns,
+        level=bytes([status.level]),
+        name=f"{node}: status",
+        message=status.message,
+        problem=problem,
+    )
 
 
 def guidance_status_from_message(message: DiagnosticArray) -> GuidanceStatus:
@@ -93,8 +89,7 @@ def guidance_status_from_message(message: DiagnosticArray) -> GuidanceStatus:
         RejectedInputError: WRONG_ARRAY_LENGTH, INVALID_STAMP, REPORT_MISSING_KEY or
             REPORT_BAD_VALUE.
     """
-    require_length("status", len(message.status), 1)
-    status = message.status[0]
+    status = only_status(message)
     reader = KeyValueReader(status)
     counts = {key: reader.integer(key) for key in _COUNTS}
     stamps: dict[str, Any] = {f"{key}_ns": reader.optional_stamp_ns(key) for key in _STAMPS}

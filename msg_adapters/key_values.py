@@ -1,4 +1,4 @@
-"""Typed values as the text pairs of diagnostic_msgs/DiagnosticStatus.
+"""Typed values as the text pairs of diagnostic_msgs/DiagnosticStatus, and messages of one status.
 
 Floats are written by ``repr``, so reading them back gives the same bits. A value that is None, or
 a float that is NaN or infinite, is left out: a missing key means "not known".
@@ -9,10 +9,11 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 
-from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
+from msg_adapters.checks import require_length
 from msg_adapters.errors import InputCode, RejectedInputError
-from msg_adapters.stamps import nanoseconds_from_stamp_text
+from msg_adapters.stamps import nanoseconds_from_stamp_text, stamp_from_nanoseconds
 
 Value = bool | int | float | str | None
 
@@ -24,6 +25,48 @@ def key_values(pairs: Iterable[tuple[str, Value]]) -> list[KeyValue]:
         for key, text in ((key, _text(value)) for key, value in pairs)
         if text is not None
     ]
+
+
+def message_of_status(
+    pairs: Iterable[tuple[str, Value]],
+    *,
+    stamp_ns: int,
+    level: bytes,
+    name: str,
+    message: str,
+    problem: str,
+    frame: str = "",
+) -> DiagnosticArray:
+    """Message of one status.
+
+    Args:
+        pairs: Its values.
+        stamp_ns: ROS time of the header.
+        level: One byte of diagnostic_msgs/DiagnosticStatus.
+        name: What it is called.
+        message: One line for people.
+        problem: What it is about.
+        frame: Of the header.
+    """
+    array = DiagnosticArray()
+    array.header.stamp = stamp_from_nanoseconds(stamp_ns)
+    array.header.frame_id = frame
+    array.status = [
+        DiagnosticStatus(
+            level=level, name=name, message=message, hardware_id=problem, values=key_values(pairs)
+        )
+    ]
+    return array
+
+
+def only_status(message: DiagnosticArray) -> DiagnosticStatus:
+    """The status of a message that has one.
+
+    Raises:
+        RejectedInputError: WRONG_ARRAY_LENGTH.
+    """
+    require_length("status", len(message.status), 1)
+    return message.status[0]
 
 
 def _text(value: Value) -> str | None:

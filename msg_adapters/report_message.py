@@ -26,8 +26,7 @@ from itertools import count
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 
-from msg_adapters.checks import require_length
-from msg_adapters.key_values import KeyValueReader, Value, key_values
+from msg_adapters.key_values import KeyValueReader, Value, message_of_status, only_status
 from msg_adapters.report import (
     AttemptFigures,
     BestEffortFigures,
@@ -39,7 +38,6 @@ from msg_adapters.report import (
 )
 from msg_adapters.stamps import (
     nanoseconds_from_stamp,
-    stamp_from_nanoseconds,
     stamp_text,
 )
 
@@ -85,19 +83,15 @@ def message_from_report(report: PlanReport, *, node: str, frame: str) -> Diagnos
         node: Name of the node; the status is called ``NODE: report``.
         frame: ``header.frame_id``, that of states and plans.
     """
-    message = DiagnosticArray()
-    message.header.stamp = stamp_from_nanoseconds(report.stamp_ns)
-    message.header.frame_id = frame
-    message.status = [
-        DiagnosticStatus(
-            level=level_of(report.code),
-            name=f"{node}: report",
-            message=report.message,
-            hardware_id=report.problem,
-            values=key_values(_pairs(report)),
-        )
-    ]
-    return message
+    return message_of_status(
+        _pairs(report),
+        stamp_ns=report.stamp_ns,
+        level=level_of(report.code),
+        name=f"{node}: report",
+        message=report.message,
+        problem=report.problem,
+        frame=frame,
+    )
 
 
 def _pairs(report: PlanReport) -> Iterator[tuple[str, Value]]:
@@ -164,8 +158,7 @@ def report_from_message(message: DiagnosticArray) -> PlanReport:
         RejectedInputError: WRONG_ARRAY_LENGTH, INVALID_STAMP, REPORT_MISSING_KEY or
             REPORT_BAD_VALUE.
     """
-    require_length("status", len(message.status), 1)
-    status = message.status[0]
+    status = only_status(message)
     reader = KeyValueReader(status)
     return PlanReport(
         stamp_ns=nanoseconds_from_stamp(message.header.stamp),

@@ -13,9 +13,8 @@ from dataclasses import dataclass
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 
-from msg_adapters.checks import require_length
-from msg_adapters.key_values import KeyValueReader, Value, key_values
-from msg_adapters.stamps import nanoseconds_from_stamp, stamp_from_nanoseconds, stamp_text
+from msg_adapters.key_values import KeyValueReader, Value, message_of_status, only_status
+from msg_adapters.stamps import nanoseconds_from_stamp, stamp_text
 
 
 @dataclass(frozen=True)
@@ -58,19 +57,15 @@ def message_from_validity(validity: Validity, *, node: str, problem: str) -> Dia
         node: Name of the node; the status is called ``NODE: validity``.
         problem: Name of the problem.
     """
-    message = DiagnosticArray()
-    message.header.stamp = stamp_from_nanoseconds(validity.stamp_ns)
     level = DiagnosticStatus.OK if validity.valid else DiagnosticStatus.WARN
-    message.status = [
-        DiagnosticStatus(
-            level=bytes(level),
-            name=f"{node}: validity",
-            message=validity.reason,
-            hardware_id=problem,
-            values=key_values(_pairs(validity)),
-        )
-    ]
-    return message
+    return message_of_status(
+        _pairs(validity),
+        stamp_ns=validity.stamp_ns,
+        level=bytes(level),
+        name=f"{node}: validity",
+        message=validity.reason,
+        problem=problem,
+    )
 
 
 def _pairs(validity: Validity) -> Iterator[tuple[str, Value]]:
@@ -92,8 +87,7 @@ def validity_from_message(message: DiagnosticArray) -> Validity:
         RejectedInputError: WRONG_ARRAY_LENGTH, INVALID_STAMP, REPORT_MISSING_KEY or
             REPORT_BAD_VALUE.
     """
-    require_length("status", len(message.status), 1)
-    reader = KeyValueReader(message.status[0])
+    reader = KeyValueReader(only_status(message))
     return Validity(
         stamp_ns=nanoseconds_from_stamp(message.header.stamp),
         valid=reader.boolean("valid"),
