@@ -18,7 +18,7 @@ import numpy as np
 import scipy.stats
 from numpy.typing import NDArray
 
-from dscp_core.problem.simulation import FlightFigure, FlightSummary, Simulation
+from dscp_core.problem.simulation import FlightFigure, FlightSummary, Simulation, exceeded
 
 Array = NDArray[np.float64]
 
@@ -167,20 +167,15 @@ def judge(figures: Sequence[FlightFigure], flight: FlightSummary) -> FailedFligh
     A flight succeeds where nothing failed and every judged figure is there and within its bound.
     """
     judged = [figure for figure in figures if figure.judged]
-    over = [
-        (figure.excess_of(flight.figures[figure.name]), figure)
-        for figure in judged
-        if figure.name in flight.figures and flight.figures[figure.name] > figure.most
-    ]
-    over.sort(key=lambda pair: -pair[0])
-    exceeded = {figure.name: flight.figures[figure.name] for _, figure in over}
+    over = exceeded(judged, flight.figures)
+    by_name = {figure.name: flight.figures[figure.name] for figure in over}
     if flight.failure:
-        return FailedFlight(flight.seed, (flight.failure,), exceeded, flight.story)
+        return FailedFlight(flight.seed, (flight.failure,), by_name, flight.story)
     missing = [f"no {figure.name}" for figure in judged if figure.name not in flight.figures]
-    classes = [figure.excess or f"{figure.name} > {figure.most:g}" for _, figure in over] + missing
+    classes = [figure.excess or f"{figure.name} > {figure.most:g}" for figure in over] + missing
     if not classes:
         return None
-    return FailedFlight(flight.seed, tuple(dict.fromkeys(classes)), exceeded, flight.story)
+    return FailedFlight(flight.seed, tuple(dict.fromkeys(classes)), by_name, flight.story)
 
 
 def share(successes: int, flights: int) -> Estimate:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -46,7 +46,7 @@ class FlightFigure:
         return math.isfinite(self.most)
 
     def excess_of(self, value: float) -> float:
-        """How many times what it may be a value is; infinite above zero where that is zero."""
+        """How many times what it may be a value is; infinite where that is zero."""
         return value / self.most if self.most > 0.0 else math.inf
 
 
@@ -74,14 +74,15 @@ class FlightSummary:
         return not self.failure and not self.worst
 
 
-def worst_of(figures: tuple[FlightFigure, ...], values: Mapping[str, float]) -> str:
+def exceeded(figures: Iterable[FlightFigure], values: Mapping[str, float]) -> list[FlightFigure]:
+    """Figures above what they may be, the furthest above first, relative to that."""
+    above = [f for f in figures if f.name in values and values[f.name] > f.most]
+    return sorted(above, key=lambda figure: -figure.excess_of(values[figure.name]))
+
+
+def worst_of(figures: Iterable[FlightFigure], values: Mapping[str, float]) -> str:
     """Name of the figure furthest above what it may be, relative to that; empty without one."""
-    excess = {
-        f.name: f.excess_of(values[f.name])
-        for f in figures
-        if f.name in values and values[f.name] > f.most
-    }
-    return max(excess, key=excess.__getitem__, default="")
+    return next((figure.name for figure in exceeded(figures, values)), "")
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from dscp_core.cone.convexity import NotConvexError
 from dscp_core.cone.program import ConePattern, ConeValues
 from dscp_core.errors import InvalidInputError
+from dscp_core.problem import checks
 from dscp_core.problem.declaration import TERMINAL_TIME, OptimalControlProblem, named
 from dscp_core.problem.flight import ControlHold, Discretisation
 from dscp_core.problem.parameters import ParameterTable
@@ -79,8 +80,7 @@ class Transcription:
         Raises:
             InvalidInputError: ``intervals`` below 2, or a function of the declaration is wrong.
         """
-        if not isinstance(intervals, int | np.integer) or intervals < 2:
-            raise InvalidInputError("intervals", intervals, "a whole number >= 2")
+        checks.whole("intervals", intervals, 2)
         self.problem = problem
         self.table: ParameterTable = problem.table
         time_scale = float(np.ravel(self.table[TERMINAL_TIME].default)[0])

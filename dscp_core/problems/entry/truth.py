@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dscp_core.problem.crossing import crossing
 from dscp_core.problem.declaration import OptimalControlProblem
 from dscp_core.problem.options import option, validate
 from dscp_core.problems.entry.motion import LIMITED, Motion
@@ -164,7 +165,7 @@ class TrueMotion:
 
             state = after(step_s)
             ends = [
-                (_root(lambda part, e=event: e(after(part)), step_s), ending)
+                (crossing(lambda part, e=event: e(after(part)), step_s), ending)
                 for ending, event in ((ARRIVED, target.passed_m), (GROUND, target.below_m))
                 if event(start) < 0.0 <= event(state)
             ]
@@ -231,16 +232,3 @@ class Target:
 
 
 _NEAR_M = 5e5
-
-
-def _root(rising: Any, end: float) -> float:
-    """Where a function that goes from below zero to above does so, to rounding."""
-    low, high = 0.0, end
-    while True:
-        middle = 0.5 * (low + high)
-        if not low < middle < high:
-            return high
-        if rising(middle) >= 0.0:
-            high = middle
-        else:
-            low = middle

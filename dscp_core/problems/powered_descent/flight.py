@@ -89,7 +89,7 @@ class Flight:
         if self.world.dry_s < math.inf:
             self.events.append((self.world.dry_s, Event.DRY.value))
         if self.world.landed:
-            self.events.append((self.world.time_s, "contact"))
+            self.events.append((self.world.time_s, Event.CONTACT.value))
         self.events.sort(key=lambda event: event[0])
 
     def _guide(self, tick: int, time_s: float) -> None:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 from enum import Enum
-from typing import Any
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from dscp_core.problem.crossing import crossing
 from dscp_core.transcription.compiled import CompiledFunction
 
 Array = NDArray[np.float64]
@@ -77,32 +77,19 @@ class TrueMotion:
             end, end_s = after(step), step
             dry = state[MASS] > dry_kg >= end[MASS]
             if dry:
-                end_s = _root(lambda part: dry_kg - after(part)[MASS], step)
+                end_s = crossing(lambda part: dry_kg - after(part)[MASS], step)
                 end = after(end_s)
             low, low_s = end, end_s
             if end[0] > ground_m and state[3] < 0.0 < end[3]:  # it may dip below in between
-                low_s = _root(lambda part: after(part)[3], end_s)
+                low_s = crossing(lambda part: after(part)[3], end_s)
                 low = after(low_s)
             if low[0] <= ground_m:
-                part = _root(lambda part: ground_m - after(part)[0], low_s)
+                part = crossing(lambda part: ground_m - after(part)[0], low_s)
                 return number * step + part, after(part), Event.CONTACT
             if dry:
                 return number * step + end_s, end, Event.DRY
             state = end
         return duration_s, state, None
-
-
-def _root(rising: Any, end: float) -> float:
-    """Where a function that goes from below zero to above does so, to rounding."""
-    low, high = 0.0, end
-    while True:
-        middle = 0.5 * (low + high)
-        if not low < middle < high:
-            return high
-        if rising(middle) >= 0.0:
-            high = middle
-        else:
-            low = middle
 
 
 def _rates(x: ca.SX, u: ca.SX, wind: ca.SX, p: ca.SX) -> ca.SX:
