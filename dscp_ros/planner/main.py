@@ -1,27 +1,17 @@
-"""Entry point of the planner node: arguments, signals, the executor's loop, a clean end."""
+"""Entry point of the planner node."""
 
 from __future__ import annotations
 
 import argparse
-import gc
-import os
-import signal
 import sys
-import threading
-from collections.abc import Callable, Sequence
-from types import FrameType
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING
 
-from dscp_core.errors import DscpError, InvalidInputError
-from dscp_ros.cli import ExitCode
+from dscp_ros.node_process import NodeCommand, RunningNode
 
 if TYPE_CHECKING:
-    from rclpy.executors import Executor
     from rclpy.node import Node
 
     from dscp_ros.planner.parameter_files import ParameterArguments
-
-NODE_NAME = "planner"
 
 DESCRIPTION = """\
 Run the planner as a ROS 2 node (default name: /planner).
@@ -51,101 +41,14 @@ examples:
 exit codes: 0 ended by SIGINT or SIGTERM, 2 bad arguments or parameters.
 """
 
-_SPIN_S = 0.1
-"""Longest wait for work; a signal is noticed no later than this."""
 
-_STOP_S = 3.0
-"""Longest wait for the attempt in hand at the end; launch files send SIGKILL after 5 to 10 s."""
-
-
-class RunningNode(Protocol):
-    """What lives on a node."""
-
-    def close(self, timeout_s: float) -> bool:
-        """End it; whether that took no longer."""
-        ...
-
-    def report_internal_error(self, error: Exception) -> None:
-        """Report an exception that a callback let through."""
-        ...
-
-
-if TYPE_CHECKING:
-    MakeNode = Callable[[Node, ParameterArguments], RunningNode]
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the command line."""
+def _add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--problem",
         metavar="PROBLEM",
         help="a known name, or FILE.py:NAME for a problem in a Python file, which is run; the same "
         "as -p problem:=PROBLEM",
     )
-    add_ros_arguments(parser)
-
-
-def add_ros_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare what is for ROS."""
-    parser.add_argument(
-        "--params-file",
-        metavar="FILE",
-        action="append",
-        default=[],
-        help="ROS parameter file (YAML); may be given several times, later ones win",
-    )
-    parser.add_argument(
-        "--ros-args",
-        nargs=argparse.REMAINDER,
-        default=[],
-        help="everything that follows is for ROS: remappings (-r), parameters (-p), log level",
-    )
-
-
-def ros_arguments(args: argparse.Namespace) -> list[str]:
-    """ROS command line of parsed arguments."""
-    files = [word for path in args.params_file for word in ("--params-file", path)]
-    words = [*files, *args.ros_args]
-    if args.problem is not None:
-        quoted = args.problem.replace("'", "''")  # rcl reads YAML
-        words += ["-p", f"problem:='{quoted}'"]
-    return ["--ros-args", *words] if words else []
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the node until a signal ends it.
-
-    Args:
-        argv: Arguments after the program's name; the process's own by default.
-
-    Returns:
-        Exit code.
-    """
-    parser = argparse.ArgumentParser(
-        prog=NODE_NAME,
-        description=DESCRIPTION,
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        allow_abbrev=False,
-    )
-    add_arguments(parser)
-    try:
-        return run(ros_arguments(parser.parse_args(argv)))
-    except DscpError as error:
-        print(f"{NODE_NAME}: error: {error}", file=sys.stderr)
-        return ExitCode.BAD_INPUT
-
-
-def run(arguments: Sequence[str]) -> int:
-    """Run the planner with a ROS command line, as the last thing that a process does.
-
-    Returns:
-        Exit code 0, after SIGINT or SIGTERM.
-
-    Raises:
-        InvalidInputError: Bad arguments or parameters.
-    """
-    return run_node(arguments, NODE_NAME, _planner_node)
 
 
 def _planner_node(node: Node, sources: ParameterArguments) -> RunningNode:
@@ -154,89 +57,7 @@ def _planner_node(node: Node, sources: ParameterArguments) -> RunningNode:
     return PlannerNode(node, sources)
 
 
-def run_node(arguments: Sequence[str], name: str, make: MakeNode) -> int:
-    """Run a node with a ROS command line, as the last thing that a process does.
-
-    Args:
-        arguments: The command line.
-        name: Name of the node.
-        make: Brings it to life.
-
-    Returns:
-        Exit code 0, after SIGINT or SIGTERM.
-
-    Raises:
-        InvalidInputError: Bad arguments or parameters.
-    """
-    stop = threading.Event()
-
-    def request_stop(_signal: int, _frame: FrameType | None) -> None:
-        stop.set()
-
-    # Before the imports below, which take most of a second; rclpy's own handlers end the context
-    # under the worker's feet, and lose a SIGTERM that comes to an idle executor.
-    previous = {
-        number: signal.signal(number, request_stop) for number in (signal.SIGINT, signal.SIGTERM)
-    }
-    after: dict[signal.Signals, Any] = previous
-    try:
-        code = _run(arguments, stop, name, make)
-        # A second Ctrl-C must not turn a clean end into a killed process.
-        after = dict.fromkeys(previous, signal.SIG_IGN)
-        return code
-    finally:
-        for number, handler in after.items():
-            signal.signal(number, handler)
-
-
-def _run(arguments: Sequence[str], stop: threading.Event, name: str, make: MakeNode) -> int:
-    import rclpy
-    from rclpy.executors import SingleThreadedExecutor
-    from rclpy.node import Node
-    from rclpy.signals import SignalHandlerOptions
-    from rclpy.utilities import try_shutdown
-
-    from dscp_ros.planner.parameter_files import check_files, parameter_arguments
-
-    sources = parameter_arguments(arguments)
-    check_files(sources)
-    try:
-        rclpy.init(args=list(arguments), signal_handler_options=SignalHandlerOptions.NO)
-    except RuntimeError as error:
-        raise InvalidInputError("ROS arguments", list(arguments), f"rcl: {error}") from None
-    try:
-        executor = SingleThreadedExecutor()
-        node = Node(name)
-        running = make(node, sources)
-        executor.add_node(node)
-        # Otherwise the collector walks all that was imported so far, for milliseconds, again and
-        # again while plans are made.
-        gc.collect()
-        gc.freeze()
-        _spin(executor, running, stop)
-        if not running.close(_STOP_S):
-            node.get_logger().warning(f"a plan is left after {_STOP_S:g} s, unfinished")
-            # Tearing ROS and Python down under a running solver may crash either.
-            os._exit(ExitCode.OK)
-        executor.shutdown()
-        node.destroy_node()
-    finally:
-        try_shutdown()
-    return ExitCode.OK
-
-
-def _spin(executor: Executor, running: RunningNode, stop: threading.Event) -> None:
-    """Serve callbacks until told to stop; an exception in one of them does not end the node."""
-    from rclpy.executors import ExternalShutdownException
-
-    while not stop.is_set():
-        try:
-            executor.spin_once(timeout_sec=_SPIN_S)
-        except ExternalShutdownException:
-            return
-        except Exception as error:  # noqa: BLE001 - reported; the node lives on
-            running.report_internal_error(error)
-
+COMMAND = NodeCommand("planner", DESCRIPTION, EPILOG, _add_arguments, _planner_node)
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(COMMAND.main())
