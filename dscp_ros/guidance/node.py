@@ -12,11 +12,9 @@ from typing import Any
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import WrenchStamped
-from rclpy.clock import Clock, JumpThreshold, TimeJump
+from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
-from rclpy.duration import Duration
 from rclpy.node import Node
-from rclpy.qos import QoSProfile, QoSReliabilityPolicy
 from rclpy.timer import Timer
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
@@ -32,8 +30,8 @@ from dscp_ros.planner.input_checks import InputGate
 from dscp_ros.planner.outputs import latched
 from dscp_ros.planner.parameter_files import ParameterArguments
 from dscp_ros.planner.parameter_server import ParameterServer
-from dscp_ros.planner.parameters import RELIABLE
 from dscp_ros.planner.session import PlannerSetup
+from dscp_ros.planner.wiring import input_quality, on_clock_set_back
 from msg_adapters.errors import RejectedInputError
 from msg_adapters.guidance import GuidanceStatus, message_from_guidance_status, wrench_from_force
 from msg_adapters.layout import problem_layout
@@ -106,22 +104,12 @@ class GuidanceNode:
             on_answer=self._publish_status,
             refuse=self._on_unreadable,
         )
-        reliability = (
-            QoSReliabilityPolicy.RELIABLE
-            if settings.state_reliability == RELIABLE
-            else QoSReliabilityPolicy.BEST_EFFORT
-        )
-        newest = QoSProfile(depth=1, reliability=reliability)
+        newest = input_quality(settings.state_reliability, 1)
         node.create_subscription(JointState, "~/vehicle_state", self._on_state, newest)
         node.create_service(Trigger, "~/reset", self._on_reset)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         node.create_timer(_STATUS_PERIOD_S, self._publish_status, clock=steady)
-        threshold = JumpThreshold(
-            min_forward=None, min_backward=Duration(nanoseconds=-1), on_clock_change=True
-        )
-        self._jump_handle = node.get_clock().create_jump_callback(
-            threshold, post_callback=self._on_clock_jump
-        )
+        self._jump_handle = on_clock_set_back(node, self._on_clock_set_back)
         node.get_logger().info(
             f"guiding {self._layout.problem} from states in {self._frame}, plans by {planner}"
         )
@@ -254,10 +242,8 @@ class GuidanceNode:
 
     # Clock, reset, status
 
-    def _on_clock_jump(self, jump: TimeJump) -> None:
-        """Begin anew when the clock was set back."""
-        jump_s = jump.delta.nanoseconds / 1e9
-        cause = f"jumped by {jump_s:.3f} s" if jump_s else "changed its source"
+    def _on_clock_set_back(self, cause: str) -> None:
+        """Begin anew."""
         self._forget(f"the clock {cause}: begins anew with the next state")
 
     def _on_reset(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:

@@ -14,11 +14,9 @@ from typing import Any
 from geometry_msgs.msg import InertiaStamped
 from nav_msgs.msg import Odometry
 from rclpy.callback_groups import ReentrantCallbackGroup
-from rclpy.clock import Clock, JumpThreshold, TimeJump
+from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
-from rclpy.duration import Duration
 from rclpy.node import Node
-from rclpy.qos import QoSProfile, QoSReliabilityPolicy
 from rclpy.task import Future as RosFuture
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Header
@@ -33,9 +31,10 @@ from dscp_ros.planner.input_checks import FROM_PARAMETER, AcceptedState, InputGa
 from dscp_ros.planner.outputs import PlanOutputs
 from dscp_ros.planner.parameter_files import ParameterArguments
 from dscp_ros.planner.parameter_server import FileChange, ParameterServer
-from dscp_ros.planner.parameters import RELIABLE, NodeSettings
+from dscp_ros.planner.parameters import NodeSettings
 from dscp_ros.planner.session import PlannerSetup, PlanningSession
 from dscp_ros.planner.validity import ValidityKeeper
+from dscp_ros.planner.wiring import input_quality, on_clock_set_back
 from dscp_ros.planner.worker import MailboxWorker
 from msg_adapters.errors import InputCode, RejectedInputError
 from msg_adapters.layout import StateLayout, problem_layout
@@ -127,13 +126,8 @@ class PlannerNode:
     def _open(self, settings: NodeSettings, layout: StateLayout) -> None:
         """Create subscriptions, services and the health timer."""
         node = self._node
-        reliability = (
-            QoSReliabilityPolicy.RELIABLE
-            if settings.state_reliability == RELIABLE
-            else QoSReliabilityPolicy.BEST_EFFORT
-        )
-        newest = QoSProfile(depth=1, reliability=reliability)
-        few = QoSProfile(depth=_MASS_DEPTH, reliability=reliability)
+        newest = input_quality(settings.state_reliability, 1)
+        few = input_quality(settings.state_reliability, _MASS_DEPTH)
         if layout.odometry is not None:
             node.create_subscription(Odometry, "~/state", self._on_state, newest)
             if layout.odometry.mass is not None:
@@ -151,12 +145,7 @@ class PlannerNode:
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         node.create_timer(_HEALTH_PERIOD_S, self._publish_health, clock=steady)
         node.create_timer(_VALIDITY_PERIOD_S, self._check_validity, clock=steady)
-        threshold = JumpThreshold(
-            min_forward=None, min_backward=Duration(nanoseconds=-1), on_clock_change=True
-        )
-        self._jump_handle = node.get_clock().create_jump_callback(
-            threshold, post_callback=self._on_clock_jump
-        )
+        self._jump_handle = on_clock_set_back(node, self._on_clock_set_back)
 
     # Inputs
 
@@ -324,10 +313,8 @@ class PlannerNode:
         self._node.get_logger().error(f"new parameters refused, the old planner stays: {error}")
         self._health.note_configuration(str(error))
 
-    def _on_clock_jump(self, jump: TimeJump) -> None:
-        """Begin anew when the clock was set back, by a simulation's reset or a bag's loop."""
-        jump_s = jump.delta.nanoseconds / 1e9
-        cause = f"jumped by {jump_s:.3f} s" if jump_s else "changed its source"
+    def _on_clock_set_back(self, cause: str) -> None:
+        """Begin anew."""
         message = f"the clock {cause}: warm start, stamps and mass forgotten"
         self._forget(NodeCode.CLOCK_JUMPED_BACK, message)
         self._node.get_logger().warning(message)
